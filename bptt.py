@@ -20,9 +20,9 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import mlp, seeing
-from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
+from diffsim.training.flags import Flags
+from diffsim.training.layers import mlp
+from diffsim.training.ranges import Count, Fraction, LogStd, Positive, Widths
 
 # Rollout lengths: section 4.2 of the SHAC paper; everything else: its authors' released settings.
 # fmt: off
@@ -37,37 +37,32 @@ PER_TASK = {
     "humanoid_imitation": ((256, 128),    128, 32, 2e-3, True,  2000),
 }
 # fmt: on
+BETAS = 0.7, 0.95  # Adam's decay rates of the gradient's first and second moment
+MAX_GRAD_NORM = 1.0
+FINAL_LR = 1e-5  # the learning rate reaches it, linearly, after the last iteration
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""
     horizon: Count = 128
     """control steps H of a rollout (per task)"""
-    deterministic_policy: bool = False
-    """train a policy without noise"""
-    hidden: Widths = (256, 128)
-    """units of the policy's hidden layers (per task)"""
-    lr: Positive = 2e-3
-    """initial learning rate (per task)"""
-    final_lr: Positive = 1e-5
-    """learning rate that it reaches, linearly, after the last iteration"""
-    normalize_obs: bool = True
-    """normalize observations by their running mean and variance (per task)"""
-    betas: tuple[Decay, Decay] = (0.7, 0.95)
-    """Adam's decay rates of the gradient's first and second moment"""
-    max_grad_norm: Positive = 1.0
-    """gradients are clipped to this norm"""
     gamma: Fraction = 0.99
     """discount factor"""
-    initial_log_std: Finite = -1.0
-    """initial log standard deviation of the policy's noise, before tanh"""
+    hidden: Widths = (256, 128)
+    """units of the policy's hidden layers (per task)"""
+    normalize_obs: bool = True
+    """normalize observations by their running mean and variance (per task)"""
+    initial_log_std: LogStd = -1.0
+    """initial log standard deviation of the policy's noise, before tanh; =-inf: a policy without noise"""
+    lr: Positive = 2e-3
+    """initial learning rate (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        return dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
+        return dict(zip(COLUMNS, PER_TASK[self.task], strict=True)) if self.task in PER_TASK else {}
 
 
 # Network --------------------------------------------------------------------------------------------------------------
@@ -78,13 +73,11 @@ class Actor(nn.Module):
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
-        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
+        obs_dim, action_dim, noiseless = env.task.obs_dim, env.scene.nu, args.initial_log_std == -math.inf
         self.normalizer = ObsNormalizer(obs_dim)
-        orthogonal, elu = args.deterministic_policy, partial(nn.ELU, inplace=True)
-        network = mlp(seen or obs_dim, args.hidden, action_dim, elu, norm=True, orthogonal=orthogonal)
-        self.mean = seeing(seen, network)
-        log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
-        self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)
+        options: dict[str, Any] = dict(norm=True, orthogonal=noiseless, columns=env.task.actor_dim)
+        self.mean = mlp(obs_dim, args.hidden, action_dim, partial(nn.ELU, inplace=True), **options)
+        self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not noiseless)
 
     def sample_noise(self, *shape: int) -> Tensor:
         """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
@@ -95,7 +88,7 @@ class Actor(nn.Module):
         return torch.tanh(self.mean(self.normalizer(obs)) + noise)
 
     def deterministic(self) -> nn.Sequential:
-        """The policy without noise, with the same weights."""
+        """Return the policy without noise, with the same weights."""
         return nn.Sequential(self.normalizer, *self.mean, nn.Tanh())
 
 
@@ -111,28 +104,25 @@ class Rollout(NamedTuple):
 
 
 class BPTT:
-    """All that the next iteration depends on, and an iteration.
-
-    It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
-    """
+    """What an iteration changes, and the iteration."""
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         self.actor = Actor(args, env).to(env.device)
         self.policy = self.actor.deterministic()
         # However large a gradient is, it is clipped and followed: the comparison shows exploding gradients.
-        self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas, skip_norm=math.inf)
+        self.optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS, skip_norm=math.inf)
 
-    def set_learning_rate(self, iteration: int) -> None:
-        args = self.args
-        self.optimizer.lr.fill_(args.lr + (args.final_lr - args.lr) * (iteration - 1) / args.iterations)
+    def iterate(self) -> dict[str, Tensor]:
+        """Act for a rollout, and step along the gradient of its loss through the simulator; returns metrics.
 
-    def update(self) -> dict[str, Tensor]:
-        """Act for a rollout, and descend its loss."""
+        It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
+        """
         args = self.args
         rollout = collect(self.env, self.actor, self.actor.sample_noise(args.horizon, self.env.num_envs))
         loss = bptt_loss(rollout.reward, rollout.done, args.gamma)
-        norm = self.optimizer.step(loss)
+        gradient = self.optimizer.gradient(loss)
+        norm = self.optimizer.step(gradient)
         if args.normalize_obs:
             self.actor.normalizer.update(rollout.obs.detach())
         found = {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped}
@@ -140,9 +130,9 @@ class BPTT:
 
 
 def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
-    """H steps of all environments from where they stand, with the policy's noise (H, N, action_dim)."""
+    """Take H steps of all environments from where they stand, with the policy's noise (H, N, action_dim)."""
     steps = []
-    obs = env.detach()
+    obs = env.detach()  # no gradient goes back to the steps before
     for step_noise in noise.unbind():
         next_obs, reward, terminated, truncated, _ = env.step(actor(obs, step_noise))
         steps.append((obs, reward, terminated | truncated))
@@ -152,11 +142,11 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 def bptt_loss(reward: Tensor, done: Tensor, gamma: float) -> Tensor:
     """Eq. 8 without its value, of (H, N) steps: the discount restarts after each done."""
-    t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
-    starts = done.roll(1, 0)
-    starts[0] = True
-    age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values  # steps since the start or the last done
-    return -(gamma ** age.to(reward.dtype) * reward).mean()
+    ages, age = [], torch.zeros_like(reward[0])
+    for ended in done:
+        ages.append(age)
+        age = (age + 1).masked_fill(ended, 0.0)
+    return -(gamma ** torch.stack(ages) * reward).mean()
 
 
 # The run --------------------------------------------------------------------------------------------------------------
@@ -166,10 +156,10 @@ def train(args: Args) -> None:
     run = Run(args)
     env = run.make_env(args.num_envs, args.horizon)
     bptt = run.restore(BPTT(args, env))
-    update = run.capture(bptt.update, env)
+    iterate = run.capture(bptt.iterate, env)
     for iteration in run:
-        bptt.set_learning_rate(iteration)
-        run.log(update())
+        bptt.optimizer.lr.fill_(args.lr + (FINAL_LR - args.lr) * (iteration - 1) / args.iterations)
+        run.log(iterate())
         if run.evaluation_due:
             run.evaluate(bptt.policy)
 

@@ -44,7 +44,7 @@ from diffsim.training import distributed, evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer
-from diffsim.training.ranges import ORDERED, Count, Natural, NonNegative, Positive, Repeats, Several
+from diffsim.training.ranges import ORDERED, AtLeast2, Count, Natural, NonNegative, Positive, UpTo10k
 from diffsim.training.run import Run
 
 STORED = 3  # times --active, the samples of S that are kept to choose from
@@ -77,7 +77,7 @@ class Args(Flags):
 
     iterations: Count = 80
     """iterations K of the policy search"""
-    horizon: Several = 500
+    horizon: AtLeast2 = 500
     """control steps T of a trajectory (per task)"""
     control_dt: Positive = 1 / 60
     """seconds of a control step, which the --substeps divide (per task)"""
@@ -87,45 +87,48 @@ class Args(Flags):
     """the example, or several: .npz of qpos (T+1, nq), qvel (T+1, nv), action (T, nu), a row a step (per task)"""
     ilqr_iterations: Natural = 0
     """iterations of trajectory optimisation, which improve the example and make it harder to learn (docs/gps.md)"""
-    guiding_samples: Several = 40
+    guiding_samples: AtLeast2 = 40
     """trajectories drawn from the guiding distributions"""
     adaptive: Natural = 0
     """number of first iterations that adapt the guides to the policy (Section 4.2; the paper: 40)"""
-    adaptive_iterations: Repeats = 50
+    adaptive_iterations: UpTo10k = 50
     """iLQR iterations of an adaptation"""
-    hidden: Repeats = 50
+    hidden: UpTo10k = 50
     """units of the policy's hidden layer (per task)"""
     noise: Positive = 0.1
     """the policy's standard deviation, relative to that of the example's actions over time (per task)"""
     tracking: NonNegative = 0.05
     """weight of the squared deviation from the example's states, only in the guides (Section 6; per task)"""
-    pretraining: Repeats = 1500
+    pretraining: UpTo10k = 1500
     """L-BFGS iterations of the fit to the guiding samples (per task)"""
-    samples: Several = 10
+    samples: AtLeast2 = 10
     """trajectories of the policy per iteration"""
-    active: Repeats = 100
+    active: UpTo10k = 100
     """trajectories in the active set S_k"""
-    lbfgs_iterations: Repeats = 60
+    lbfgs_iterations: UpTo10k = 60
     """L-BFGS iterations of each of an iteration's two optimisations"""
     regularizer_bounds: Annotated[tuple[NonNegative, NonNegative], ORDERED] = (1e-6, 1e-2)
     """w_r starts at their geometric mean and is changed by factors of ten between them; 0 0: no regularizer"""
 
     def task_defaults(self) -> dict[str, Any]:
         task, own = find_task(self.env), dict[str, Any](eval_every=10, eval_episodes=50)
-        if self.env not in PER_TASK:
+        if self.task not in PER_TASK:
             return own
-        own |= dict(zip(COLUMNS, PER_TASK[self.env], strict=True))
+        own |= dict(zip(COLUMNS, PER_TASK[self.task], strict=True))
         preset = task.integration(self.accuracy, self.contact).substeps / task.control_dt
-        substeps = math.ceil(preset * PER_TASK[self.env][1] - 1e-6)
-        return own | {"substeps": substeps, "demonstration": EXAMPLES / f"{self.env}.npz"}
+        substeps = math.ceil(preset * PER_TASK[self.task][1] - 1e-6)
+        return own | {"substeps": substeps, "demonstration": EXAMPLES / f"{self.task}.npz"}
 
     def check(self) -> None:
         super().check()
         if distributed.size() > 1:
             fail("trains in one process; start it without torchrun")
-        if find_task(self.env).num_memory:
+        task = find_task(self.env)
+        if task.varied_by or hasattr(task, "slope"):
+            fail(f"guides are of one robot on a plane, but {self.env} varies: leave its options out")
+        if task.num_memory:
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
-        if (seen := find_task(self.env).actor_dim) is not None:
+        if (seen := task.actor_dim) is not None:
             fail(f"{self.env} shows its actor the first {seen} numbers of an observation, and this policy takes all")
         if not (self.demonstration or self.resume or self.evaluate):
             fail(f"--demonstration must be an example for {self.env}; shipped are those of {', '.join(PER_TASK)}")
@@ -298,9 +301,9 @@ class Search:
     def reward(self, x: Tensor, u: Tensor) -> Tensor:
         """What is optimised (Section 6): reward (...) of u (..., nu), which led to x (..., nx)."""
         system, cost = self.system, self.args.action_cost * u.square().sum(-1)
-        if self.args.env not in TARGETS:
+        if self.args.task not in TARGETS:
             return system.reward(x, u) - cost
-        target_velocity, target_height, height_weight, attitude_weight = TARGETS[self.args.env]
+        target_velocity, target_height, height_weight, attitude_weight = TARGETS[self.args.task]
         if system.scene.floating:
             height, attitude = x[..., 2], 4.0 * x[..., 4:7].square().sum(-1)
         else:

@@ -28,10 +28,21 @@ from diffsim.extra.learning.replay import ReplayBuffer, Transition
 from diffsim.extra.planning import System
 from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, mlp, seeing
+from diffsim.training.flags import Flags
+from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Batch, Count, Few, Fraction, Natural, Positive, Repeats, Several, SomeWidths, Widths
+from diffsim.training.ranges import (
+    AtLeast2,
+    Batch,
+    Count,
+    Fraction,
+    Natural,
+    Positive,
+    SomeWidths,
+    UpTo10k,
+    UpTo1000,
+    Widths,
+)
 
 # Policies and values: as SAC's, from Table 3 of the SHAC paper. Rollout lengths: MBPO's released settings.
 # fmt: off
@@ -46,6 +57,9 @@ PER_TASK = {
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # fmt: on
 MAX_GRAD_NORM = 100.0  # gradients of large values reach it
+MODEL_LR = 1e-3
+RETAIN = 4  # iterations whose imagined rollouts stay in the buffer
+TAU = 0.005  # target critics <- (1 - tau) target critics + tau critics, after each update
 LOG_STD = (-5.0, 2.0)  # bounds of the policy's log standard deviation
 LOG_VAR = (-10.0, 0.5)  # where the bounds of the models' log variance begin, in normalized units
 BOUND_WEIGHT = 0.01  # of the pull that closes them
@@ -54,38 +68,36 @@ HELD_OUT_BATCH = 1024
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(Flags):
     """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
 
+    num_envs: Count = 64
+    """parallel environments N (per task)"""
     steps: Count = 16
     """control steps of an iteration"""
     seed_steps: Natural = 64
     """control steps of each environment with random actions before the first update"""
     buffer_size: Count = 1_000_000
     """real transitions in the replay buffer, over all environments"""
-    models: Several = 7
+    models: AtLeast2 = 7
     """networks of the ensemble"""
-    elites: Few = 5
+    elites: UpTo1000 = 5
     """networks that make the rollouts: those that predict held-out transitions best"""
     model_hidden: Widths = (200, 200, 200, 200)
     """units of the models' hidden layers (per task)"""
-    model_updates: Repeats = 50
+    model_updates: UpTo10k = 50
     """gradient updates of the models in an iteration"""
     model_batch_size: Batch = 256
     """samples per model in each of these updates"""
-    model_lr: Positive = 1e-3
-    """learning rate of the models"""
     branches: Count = 1000
     """rollouts that each elite makes at once, branched from real states"""
     rollout_lengths: tuple[Count, Count] = (1, 1)
     """steps of a rollout at first and from half of the iterations on; they grow linearly between (per task)"""
-    retain: Repeats = 4
-    """iterations whose rollouts stay in the buffer"""
     sample_enhance: Natural = 0
     """SE-MBPO: transitions added around each real one with the simulator's Jacobians (0: MBPO)"""
     enhance_scale: Positive = 0.2
     """distance of added states, in root mean square changes of a control step, and of actions before tanh"""
-    updates: Repeats = 160
+    updates: UpTo10k = 160
     """gradient updates of actor, critics and temperature in an iteration"""
     batch_size: Batch = 256
     """samples of each of these updates"""
@@ -99,11 +111,9 @@ class Args(ParallelFlags):
     """learning rate of the temperature's logarithm (per task)"""
     gamma: Fraction = 0.99
     """discount factor"""
-    tau: Fraction = 0.005
-    """target critics <- (1 - tau) target critics + tau critics, after each update"""
 
     def task_defaults(self) -> dict[str, Any]:
-        own = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        own = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
         return own | {"save_every": 500}  # a checkpoint holds the buffers
 
     def check(self) -> None:
@@ -140,7 +150,7 @@ class Actor(nn.Module):
         super().__init__()
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
+        self.body = mlp(obs_dim, args.hidden, None, nn.ReLU, columns=seen)
         self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,8 +229,8 @@ class MBPO:
         self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.actor_lr)
         self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.actor_lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
-        self.model_optimizer = ClippedAdam(self.models, MAX_GRAD_NORM, lr=args.model_lr)
-        imagined = args.retain * args.elites * args.branches * args.rollout_lengths[1]
+        self.model_optimizer = ClippedAdam(self.models, MAX_GRAD_NORM, lr=MODEL_LR)
+        imagined = RETAIN * args.elites * args.branches * args.rollout_lengths[1]
         held_out = max(args.steps * self.held_out, args.buffer_size // HELD_OUT)
         buffers = (ReplayBuffer(size, obs_dim, action_dim) for size in (args.buffer_size, held_out, imagined))
         self.real, self.unseen, self.imagined = (buffer.to(env.device) for buffer in buffers)
@@ -270,7 +280,8 @@ class MBPO:
             mean, log_var = models(obs, action)
             nll = 0.5 * ((target - mean).square() * (-log_var).exp() + log_var + math.log(2 * math.pi))
             width = (models.most - models.least).sum()
-            self.model_optimizer.step(nll.mean((1, 2)).sum() + BOUND_WEIGHT * width)
+            loss = nll.mean((1, 2)).sum() + BOUND_WEIGHT * width
+            self.model_optimizer.step(self.model_optimizer.gradient(loss))
             losses.append(nll.detach().mean())
         with torch.no_grad():
             batch = self.unseen.sample(HELD_OUT_BATCH)
@@ -298,7 +309,7 @@ class MBPO:
             action, _ = self.actor(seen)
             change, reward = models.predict(seen, action)
             next_obs = obs + change
-            terminated = self.env.task.terminated(next_obs) & args.early_termination
+            terminated = self.env.task.terminated(next_obs)
             self.imagined.add(Transition(obs, action, reward, next_obs, terminated.to(reward.dtype)))
             over = terminated | (age >= length)
             obs = torch.where(over.unsqueeze(1), self.real.sample(len(obs)).obs, next_obs)
@@ -328,9 +339,9 @@ class MBPO:
             target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
         values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
-        norm = self.critic_optimizer.step(loss)
+        norm = self.critic_optimizer.step(self.critic_optimizer.gradient(loss))
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
-            slow.lerp_(fast.detach(), args.tau)
+            slow.lerp_(fast.detach(), TAU)
         return {"losses/critic": loss.detach() / 2, "charts/value": values.detach().mean(), "grad/norm": norm}
 
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
@@ -338,9 +349,10 @@ class MBPO:
         action, density = self.actor(obs)
         value = self.critics.value(obs, action).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
-        self.actor_optimizer.step(loss)
+        self.actor_optimizer.step(self.actor_optimizer.gradient(loss))
         surplus = action.shape[1] - density.detach().mean()  # of entropy over the target
-        self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
+        weighted = self.temperature["log"].exp() * surplus
+        self.temperature_optimizer.step(self.temperature_optimizer.gradient(weighted))
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
 
 
@@ -378,7 +390,7 @@ def enhance(mbpo: MBPO, state: Tensor, made: Transition) -> Transition:
     # A part of the observation may be the action before, which stays as it was.
     obs = made.obs + observe(start, 0 * action) - observe(state, 0 * made.action)
     next_obs = observe(end, action)
-    terminated = task.terminated(next_obs) & args.early_termination | ~finite
+    terminated = task.terminated(next_obs) | ~finite
     reward = task.reward(next_obs, action) * finite
     parts = Transition(obs, action, reward, next_obs, terminated.to(reward.dtype))
     return Transition(*(x.flatten(0, 1) for x in parts))

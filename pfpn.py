@@ -22,10 +22,10 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments, seeing
+from diffsim.training.flags import Flags
+from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Bounds, Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.ranges import AtLeast2, Bounds, Count, Decay, Fraction, NonNegative, Positive, SomeWidths, UpTo10k
 
 # The settings of ppo_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
 # fmt: off
@@ -45,14 +45,14 @@ MAX_GRAD_NORM, TARGET_KL, CLIP, VALUE_COEF, BOUND_COEF = 1.0, 0.008, 0.2, 2.0, 1
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(Flags):
     """The policy, and PPO. Defaults are the humanoid's."""
 
     policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
     """particles; one Gaussian; a mixture whose locations and scales also depend on the state; fixed bins"""
     std: Literal["state", "own"] = "state"
     """standard deviation of the Gaussian policy: a function of the state, or one parameter per action"""
-    particles: Several = 35
+    particles: AtLeast2 = 35
     """particles (components, bins) of each action"""
     initial_log_std: float | None = None
     """log standard deviation of the first actions (default: a Gaussian's is 0, components cover [-1, 1], about -0.5)"""
@@ -67,6 +67,8 @@ class Args(ParallelFlags):
     dead_by: Literal["mean", "max"] = "mean"
     """weight that decides: the mean over the recorded steps, or the largest (Eq. 8)"""
 
+    num_envs: Count = 1024
+    """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
     horizon: Count = 32
     """control steps of a rollout (per task)"""
     hidden: SomeWidths = (256, 128, 64)
@@ -79,7 +81,7 @@ class Args(ParallelFlags):
     """discount factor"""
     gae_lambda: Fraction = 0.95
     """lambda of the advantage estimation"""
-    epochs: Repeats = 5
+    epochs: UpTo10k = 5
     """passes over the samples of a rollout (per task)"""
     minibatch_size: Count = 8192
     """samples of an update (per task; on a CPU at most 2048)"""
@@ -87,7 +89,7 @@ class Args(ParallelFlags):
     """weight of the entropy bonus, which keeps the policy's noise from vanishing (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, PER_TASK["humanoid"]), strict=True))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, PER_TASK["humanoid"]), strict=True))
         if self.device == "cpu":
             values |= {name: min(values[name], most) for name, most in CPU.items()}
         return values | {"eval_every": 500, "save_every": 500}
@@ -229,7 +231,7 @@ class Actor(nn.Module):
         super().__init__()
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ELU))
+        self.body = mlp(obs_dim, args.hidden, None, nn.ELU, columns=seen)
         self.head = Head(args, args.hidden[-1], action_dim)
         self.value = nn.Linear(args.hidden[-1], 1)
 
@@ -335,10 +337,7 @@ class Batch(NamedTuple):
 
 
 class PPO:
-    """All that the next iteration depends on, and its two halves.
-
-    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
-    """
+    """What an iteration changes, and the iteration."""
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
@@ -347,13 +346,26 @@ class PPO:
         self.resampling = Resampling(args, self.actor.head).to(env.device)
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.lr)
-        samples, sizes = args.horizon * env.num_envs, ((env.task.obs_dim,), (env.scene.nu,), (), (), ())
-        self.batch = Batch(*(torch.zeros(samples, *size, device=env.device) for size in sizes))
-        self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
+        self.minibatches = math.ceil(args.horizon * env.num_envs / args.minibatch_size * distributed.size())
+
+    def iterate(self) -> dict[str, Tensor]:
+        """Act for a rollout, descend the clipped loss in epochs of minibatches, then resample; returns metrics.
+
+        It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
+        """
+        samples, found = self.sample()
+        rows = []
+        for _ in range(self.args.epochs):
+            order = torch.randperm(len(samples.obs), device=self.env.device)
+            for tensors in zip(*(tensor[order].chunk(self.minibatches) for tensor in samples), strict=True):
+                rows.append(self.update(Batch(*tensors)))
+        found |= {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
+        found |= {"grad/skipped": self.optimizer.skipped, "charts/learning_rate": self.optimizer.lr}
+        return found | self.resampling.end_iteration(self.actor.head, self.optimizer)
 
     @torch.no_grad()
-    def interact(self) -> dict[str, Tensor]:
-        """Act for a rollout, and keep its samples with their advantages and value targets."""
+    def sample(self) -> tuple[Batch, dict[str, Tensor]]:
+        """Act for a rollout: its samples with their advantages and value targets, and metrics."""
         args, normalizer, steps, obs = self.args, self.actor.normalizer, [], self.env.detach()
         for _ in range(args.horizon):
             mixture, value = self.actor(normalizer(obs))
@@ -373,27 +385,12 @@ class PPO:
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
         samples = normalizer(rollout.obs), rollout.action, rollout.log_prob, advantage, self.return_normalizer(target)
-        for buffer, tensor in zip(self.batch, samples, strict=True):
-            buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(rollout.obs)
-        return {"losses/entropy": mixture.entropy().mean(), "losses/explained_variance": explained}
-
-    def learn(self) -> dict[str, Tensor]:
-        """Descend the clipped loss in epochs of minibatches, then resample."""
-        rows = []
-        for _ in range(self.args.epochs):
-            order = torch.randperm(len(self.batch.obs), device=self.env.device)
-            for tensors in zip(*(tensor[order].chunk(self.minibatches) for tensor in self.batch), strict=True):
-                rows.append(self.update(Batch(*tensors)))
-        return {
-            **{name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]},
-            "grad/skipped": self.optimizer.skipped,
-            "charts/learning_rate": self.optimizer.lr,
-            **self.resampling.end_iteration(self.actor.head, self.optimizer),
-        }
+        found = {"losses/entropy": mixture.entropy().mean(), "losses/explained_variance": explained}
+        return Batch(*(tensor.flatten(0, 1) for tensor in samples)), found
 
     def update(self, batch: Batch) -> dict[str, Tensor]:
-        """One step on a minibatch, with a learning rate that keeps the policy near the one that acted."""
+        """Take one step on a minibatch, with a learning rate that keeps the policy near the one that acted."""
         mixture, value = self.actor(batch.obs)
         log_ratio = mixture.log_prob(batch.action) - batch.log_prob
         kl = distributed.average((log_ratio.detach().expm1() - log_ratio.detach()).mean())  # estimated; not below zero
@@ -407,9 +404,14 @@ class PPO:
         loss = policy_loss + VALUE_COEF * value_loss + BOUND_COEF * bound_loss
         if self.args.entropy_coef:
             loss = loss - self.args.entropy_coef * mixture.entropy().mean()
-        found = {"losses/policy_loss": policy_loss.detach(), "losses/value_loss": value_loss.detach()}
-        found |= {"losses/approx_kl": kl, "losses/clipfrac": ((ratio.detach() - 1).abs() > CLIP).to(kl.dtype).mean()}
-        return found | {"grad/norm": self.optimizer.step(loss)}
+        gradient = self.optimizer.gradient(loss)
+        return {
+            "losses/policy_loss": policy_loss.detach(),
+            "losses/value_loss": value_loss.detach(),
+            "losses/approx_kl": kl,
+            "losses/clipfrac": ((ratio.detach() - 1).abs() > CLIP).to(kl.dtype).mean(),
+            "grad/norm": self.optimizer.step(gradient),
+        }
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
@@ -432,9 +434,9 @@ def train(args: Args) -> None:
     run = Run(args)
     env = run.make_env(args.num_envs, args.horizon)
     ppo = run.restore(PPO(args, env))
-    interact, learn = run.capture(ppo.interact, env), run.capture(ppo.learn)
+    iterate = run.capture(ppo.iterate, env)
     for _ in run:
-        run.log(interact() | learn())
+        run.log(iterate())
         if run.evaluation_due:
             run.evaluate(ppo.policy)
 

@@ -25,10 +25,10 @@ from diffsim import DiffEnv
 from diffsim.extra.learning.ensemble import Ensemble
 from diffsim.extra.learning.replay import ReplayBuffer, Transition
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, seeing
+from diffsim.training.flags import Flags
+from diffsim.training.layers import Likeliest, ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Batch, Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.ranges import AtLeast2, Batch, Count, Decay, Fraction, NonNegative, Positive, SomeWidths, UpTo10k
 
 # The settings of sac_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
 # fmt: off
@@ -44,16 +44,17 @@ PER_TASK = {
 # fmt: on
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation of a component
 MAX_GRAD_NORM = 100.0  # sac_baseline.py's
+TAU = 0.005  # target critics <- (1 - tau) target critics + tau critics, after each update
 DENSITY = 0.01  # of an action, at least, in the implicit gradient
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(Flags):
     """The policy, and SAC. Defaults are the humanoid's."""
 
     policy: Literal["pfpn", "gaussian"] = "pfpn"
     """particles, or one Gaussian"""
-    particles: Several = 35
+    particles: AtLeast2 = 35
     """particles of each action"""
     estimator: Literal["implicit", "straight-through"] = "implicit"
     """gradient of a sampled action in the particles' weights: the one without bias, or the paper's"""
@@ -64,6 +65,8 @@ class Args(ParallelFlags):
     dead: Decay = 0.05
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
 
+    num_envs: Count = 64
+    """parallel environments N (per task)"""
     horizon: Count = 32
     """control steps of a rollout"""
     hidden: SomeWidths = (512, 256)
@@ -76,17 +79,15 @@ class Args(ParallelFlags):
     """learning rate of the temperature's logarithm (per task)"""
     gamma: Fraction = 0.99
     """discount factor"""
-    epochs: Repeats = 1
+    epochs: UpTo10k = 1
     """updates per control step"""
     minibatch_size: Batch = 2048
     """samples of an update (per task)"""
-    tau: Fraction = 0.005
-    """target critics <- (1 - tau) target critics + tau critics, after each update"""
     buffer_size: Count = 1_000_000
     """transitions in the replay buffer, over all environments"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, PER_TASK["humanoid"]), strict=True))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, PER_TASK["humanoid"]), strict=True))
         rare = {"eval_every": 500, "save_every": 500}  # a checkpoint holds the replay buffer
         return values | rare | {"critic_hidden": values["hidden"]}
 
@@ -193,7 +194,7 @@ class Actor(nn.Module):
         super().__init__()
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
+        self.body = mlp(obs_dim, args.hidden, None, nn.ReLU, columns=seen)
         self.head = Head(args, args.hidden[-1], action_dim)
 
     def forward(self, obs: Tensor) -> Mixture:
@@ -295,10 +296,7 @@ class Resampling(nn.Module):
 
 
 class SAC:
-    """All that the next iteration depends on, and its two halves.
-
-    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
-    """
+    """What an iteration changes, and the iteration."""
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
@@ -317,25 +315,13 @@ class SAC:
         self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
 
-    @torch.no_grad()
-    def interact(self) -> dict[str, Tensor]:
-        """Act for a rollout, into the buffer."""
-        steps, obs, normalizer = [], self.env.detach(), self.actor.normalizer
-        for _ in range(self.args.horizon):
-            mixture = self.actor(normalizer(obs))
-            self.resampling.record(mixture)
-            action = torch.tanh(mixture.sample())
-            next_obs, reward, terminated, _, info = self.env.step(action)
-            steps.append((obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
-            obs = next_obs
-        rollout = Transition(*(torch.cat(tensors) for tensors in zip(*steps, strict=True)))
-        self.buffer.add(rollout)
-        normalizer.update(rollout.obs)
-        return {}
+    def iterate(self) -> dict[str, Tensor]:
+        """Act for a rollout, make as many updates as control steps, times the epochs, then resample; returns metrics.
 
-    def learn(self) -> dict[str, Tensor]:
-        """As many updates as there were control steps, times the epochs; then resample."""
+        It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
+        """
         normalizer, rows = self.actor.normalizer, []
+        self.act()
         for _ in range(self.args.horizon * self.args.epochs):
             batch = self.buffer.sample(self.args.minibatch_size)
             obs, next_obs = normalizer(batch.obs), normalizer(batch.next_obs)
@@ -349,6 +335,21 @@ class SAC:
             **self.resampling.end_iteration(self.actor.head, self.optimizer),
         }
 
+    @torch.no_grad()
+    def act(self) -> None:
+        """Act for a rollout, into the buffer."""
+        steps, obs, normalizer = [], self.env.detach(), self.actor.normalizer
+        for _ in range(self.args.horizon):
+            mixture = self.actor(normalizer(obs))
+            self.resampling.record(mixture)
+            action = torch.tanh(mixture.sample())
+            next_obs, reward, terminated, _, info = self.env.step(action)
+            steps.append((obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
+            obs = next_obs
+        rollout = Transition(*(torch.cat(tensors) for tensors in zip(*steps, strict=True)))
+        self.buffer.add(rollout)
+        normalizer.update(rollout.obs)
+
     def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
         """Descend the soft Bellman residual, and let the target critics follow."""
         with torch.no_grad():
@@ -359,9 +360,9 @@ class SAC:
             target = batch.reward + self.args.gamma * (1 - batch.terminated) * soft
         value = self.critics.value(obs, batch.action)
         loss = (value - target).square().mean(1).sum()
-        self.critic_optimizer.step(loss)
+        self.critic_optimizer.step(self.critic_optimizer.gradient(loss))
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
-            slow.lerp_(fast.detach(), self.args.tau)
+            slow.lerp_(fast.detach(), TAU)
         return {"losses/critic": loss.detach() / 2, "charts/value": value.detach().mean()}
 
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
@@ -371,9 +372,10 @@ class SAC:
         density = mixture.log_prob(u)
         value = self.critics.value(obs, torch.tanh(u)).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
-        norm = self.optimizer.step(loss)
+        norm = self.optimizer.step(self.optimizer.gradient(loss))
         surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
-        self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
+        weighted = self.temperature["log"].exp() * surplus
+        self.temperature_optimizer.step(self.temperature_optimizer.gradient(weighted))
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
 
 
@@ -384,9 +386,9 @@ def train(args: Args) -> None:
     run = Run(args)
     env = run.make_env(args.num_envs, args.horizon)
     sac = run.restore(SAC(args, env))
-    interact, learn = run.capture(sac.interact, env), run.capture(sac.learn)
+    iterate = run.capture(sac.iterate, env)
     for _ in run:
-        run.log(interact() | learn())
+        run.log(iterate())
         if run.evaluation_due:
             run.evaluate(sac.policy)
 

@@ -5,7 +5,6 @@ imitates the result. First order steps along the gradient of the return, second 
 
     python pods.py --env cartpole --seed 1                      train; writes runs/cartpole__pods__1__<time>/
     python pods.py --env cartpole --order 2                     Gauss-Newton steps from exact Jacobians
-    python pods.py --env ant --no-early-termination             a task that would end episodes early
     python pods.py --resume <run>/checkpoint.pt                 continue an interrupted run exactly
     python pods.py --evaluate <run>/checkpoint.pt               evaluate its policy
 """
@@ -25,8 +24,8 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import mlp, seeing
-from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
+from diffsim.training.layers import mlp
+from diffsim.training.ranges import Count, NonNegative, Positive, UpTo10k, Widths
 
 # fmt: off
 COLUMNS = ("hidden", "horizon", "normalize_obs")
@@ -41,6 +40,7 @@ PER_ORDER = {
     2: (16,  13, 20, "improved", 50, 2e-3),
 }
 # fmt: on
+MAX_GRAD_NORM = 1.0  # of the imitation
 
 
 @dataclass
@@ -55,9 +55,9 @@ class Args(Flags):
     """action sequences N of an iteration (per order)"""
     horizon: Count = 50
     """control steps T of a sequence; an episode must be a multiple of them (per task)"""
-    improvements: Repeats = 1
+    improvements: UpTo10k = 1
     """line-searched steps of each sequence in an iteration (per order)"""
-    candidates: Repeats = 8
+    candidates: UpTo10k = 8
     """first order: step sizes of the line search, each half the one before"""
     max_step: Positive = 1.0
     """first order: largest step size, as root mean square change of the actions before tanh"""
@@ -67,21 +67,19 @@ class Args(Flags):
     """second order: cost of the squared action before tanh, which bounds it where tanh is flat"""
     imitate: Literal["visited", "improved"] = "visited"
     """states at which improved actions are taught: those visited by the policy, or by these actions (per order)"""
-    epochs: Repeats = 4
+    epochs: UpTo10k = 4
     """passes of the imitation over the sequences (per order)"""
     batch_size: Count = 512
     """states of an imitation update"""
     lr: Positive = 1e-3
     """learning rate of the imitation (per order)"""
-    max_grad_norm: Positive = 1.0
-    """gradients of the imitation are clipped to this norm"""
     hidden: Widths = (128, 64, 32)
     """units of the policy's hidden layers (per task)"""
     normalize_obs: bool = True
     """normalize observations by their running mean and variance (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        own = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        own = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
         return own | dict(zip(ORDER_COLUMNS, PER_ORDER[self.order], strict=True))
 
     def check(self) -> None:
@@ -91,8 +89,8 @@ class Args(Flags):
             fail("start it without torchrun: processes do not share sequences")
         if task.num_memory:
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
-        if self.early_termination and task.falls():
-            fail(f"{self.env} ends episodes early, and all sequences have one length: give --no-early-termination")
+        if task.varied_by or hasattr(task, "slope"):
+            fail(f"planned sequences are of one robot on a plane, but {self.env} varies: leave its options out")
         if task.episode_length % self.horizon:
             fail(f"--horizon {self.horizon} does not divide the {task.episode_length} control steps of an episode")
 
@@ -107,7 +105,7 @@ class Actor(nn.Module):
         super().__init__()
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
-        self.mean = seeing(seen, mlp(seen or obs_dim, args.hidden, action_dim, nn.ELU, norm=True))
+        self.mean = mlp(obs_dim, args.hidden, action_dim, nn.ELU, norm=True, columns=seen)
 
     def forward(self, obs: Tensor) -> Tensor:
         """u (..., action_dim), the action before tanh."""
@@ -210,13 +208,13 @@ def gauss_newton(
 
 
 class PODS:
-    """All that the next iteration depends on, and the halves of an iteration."""
+    """What an iteration changes, and the iteration."""
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         self.actor = Actor(args, env).to(env.device)
         self.policy = self.actor.deterministic()
-        self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.lr)
+        self.optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.lr)
         self.control_steps = 0  # of the iteration
         threads = args.threads or None
         if args.order == 1:
@@ -228,8 +226,8 @@ class PODS:
             self.reward = AfterStep(self.system, lambda x, u: -self.system.reward(x, u))
             self.cost = Sum((self.reward, AfterStep(self.system, lambda _, u: args.action_cost * u.square().sum(-1))))
 
-    def improve(self) -> dict[str, Tensor]:
-        """Act for T steps, improve the actions, and keep them as lessons."""
+    def iterate(self) -> dict[str, Tensor]:
+        """Act for T steps, improve the actions, and imitate them; returns metrics."""
         args, env, count = self.args, self.env, self.args.horizon * self.env.num_envs
         start = Start(env.qpos, env.qvel, env.detach())
         u, visited, whole = self.act()
@@ -244,7 +242,6 @@ class PODS:
             first, new = self.plan(start, u)
         assert first is not None
         whole = whole & torch.isfinite(first)
-        self.lessons = visited if args.imitate == "visited" else new.obs, torch.tanh(new.u), whole
         if args.normalize_obs:
             self.actor.normalizer.update(visited)
 
@@ -257,6 +254,7 @@ class PODS:
             "pods/step": mean((new.u - u).square().mean((0, 2)).sqrt()),
             "pods/failed": 1.0 - mean((new.returns > first).float()),
             "pods/left_out": (~whole).float().mean(),
+            **self.imitate(visited if args.imitate == "visited" else new.obs, torch.tanh(new.u), whole),
         }
 
     @torch.no_grad()
@@ -285,9 +283,9 @@ class PODS:
         obs = torch.cat((start.obs.unsqueeze(0), self.env.task.observe(qpos, qvel, torch.tanh(u[:-1]))))
         return old, Sequences(u, obs, returns)
 
-    def imitate(self) -> dict[str, Tensor]:
-        """Regress the policy on the improved actions."""
-        args, (obs, action, whole) = self.args, self.lessons
+    def imitate(self, obs: Tensor, action: Tensor, whole: Tensor) -> dict[str, Tensor]:
+        """Regress the policy on actions (T, N, nu) at observations (T, N, obs_dim), of whole sequences (N,)."""
+        args = self.args
         weight = whole.float().expand(len(obs), -1).flatten()
         obs, action = obs.flatten(0, 1), action.flatten(0, 1)
         losses = []
@@ -295,7 +293,7 @@ class PODS:
             for index in torch.rand(len(obs), device=obs.device).argsort().split(args.batch_size):
                 error = (torch.tanh(self.actor(obs[index])) - action[index]).square().sum(-1)
                 loss = 0.5 * (weight[index] * error).sum() / weight[index].sum().clamp(min=1.0)
-                norm = self.optimizer.step(loss)
+                norm = self.optimizer.step(self.optimizer.gradient(loss))
                 losses.append(loss.detach())
         per_epoch = torch.stack(losses).view(args.epochs, -1).mean(1)
         found = {"losses/imitation": per_epoch[-1], "losses/first_epoch": per_epoch[0]}
@@ -308,11 +306,11 @@ class PODS:
 
 def train(args: Args) -> None:
     run = Run(args)
-    env = run.make_env(args.num_envs, args.horizon)
+    env = run.make_env(args.num_envs, args.horizon, early_termination=False)  # all sequences have one length
     pods = run.restore(PODS(args, env))
-    improve, imitate = run.capture(pods.improve), run.capture(pods.imitate)
+    iterate = run.capture(pods.iterate, eager=True)
     for _ in run:
-        run.log(improve() | imitate(), pods.control_steps)
+        run.log(iterate(), pods.control_steps)
         if run.evaluation_due:
             run.evaluate(pods.policy)
 

@@ -20,11 +20,12 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.mirror import Mirror
+from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, script
-from diffsim.training.flags import SymmetricFlags
-from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, moments, seeing
+from diffsim.training.flags import Flags
+from diffsim.training.layers import ObsNormalizer, make_symmetric, mirror_inputs, mirror_outputs, mlp, moments
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Bounds, Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
+from diffsim.training.ranges import Bounds, Count, Finite, Fraction, Natural, NonNegative, Positive, UpTo10k, Widths
 
 # Table 2 of the SHAC paper; networks, iterations, hopper and half_cheetah: its authors' released settings. They have no
 # entropy bonus, with which hopper and ant learn more (docs/ppo.md).
@@ -43,77 +44,79 @@ PER_TASK = {
 # fmt: on
 BALANCING = {"g1_track": {"initial_log_std": -1.0}}  # more noise throws it over
 CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more of each
+MAX_GRAD_NORM = 1.0
+TARGET_KL = 0.008  # the learning rate falls if a minibatch's KL divergence is above twice this, rises below half of it
+CLIP = 0.2  # the probability ratio counts only within 1 - CLIP and 1 + CLIP
+VALUE_COEF = 2.0  # weight of the value's squared error, in units of its standard deviation
+BOUND, BOUND_COEF = 1.1, 1e-4  # weight of the squared excess of the policy's mean, as actions are clipped at 1
 
 
 @dataclass
-class Args(SymmetricFlags):
+class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
     iterations: Count = 5000
     """learning iterations (per task)"""
+    eval_every: Natural = 500
+    """evaluate the policy without noise every this many iterations (0: only at the end)"""
     num_envs: Count = 1024
     """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
     horizon: Count = 32
-    """control steps of a rollout (per task)"""
-    hidden: Widths = (256, 128, 64)
-    """units of the hidden layers, which policy and value share (per task)"""
-    lr: Positive = 3e-4
-    """initial learning rate, which then follows the KL divergence of the updates"""
-    target_kl: Positive = 0.008
-    """the learning rate falls if a minibatch's KL divergence is above twice this, and rises if it is below half"""
-    lr_bounds: Bounds = (1e-6, 1e-2)
-    """smallest and largest learning rate; two equal numbers fix it"""
-    max_grad_norm: Positive = 1.0
-    """gradients are clipped to this norm"""
+    """control steps H of a rollout (per task)"""
     gamma: Fraction = 0.99
     """discount factor"""
     gae_lambda: Fraction = 0.95
     """lambda of the advantage estimation"""
-    epochs: Repeats = 5
+    hidden: Widths = (256, 128, 64)
+    """units of the hidden layers, which policy and value share (per task)"""
+    initial_log_std: Finite = 0.0
+    """initial log standard deviation of the policy's noise (per task)"""
+    epochs: UpTo10k = 5
     """passes over the samples of a rollout (per task)"""
     minibatch_size: Count = 8192
     """samples of an update (per task; on a CPU at most 2048)"""
-    clip_coef: Positive = 0.2
-    """the probability ratio counts only within 1 - clip and 1 + clip"""
-    value_coef: NonNegative = 2.0
-    """weight of the value's squared error, in units of its standard deviation"""
     entropy_coef: NonNegative = 0.0
     """weight of the entropy bonus, which keeps the policy's noise from vanishing (per task)"""
-    bound_coef: NonNegative = 1e-4
-    """weight of the squared excess of the policy's mean beyond 1.1, where the action is clipped"""
-    initial_log_std: Finite = 0.0
-    """initial log standard deviation of the policy's noise"""
-    eval_every: Natural = 500
-    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
+    lr: Positive = 3e-4
+    """initial learning rate, which then follows the KL divergence of the updates"""
+    lr_bounds: Bounds = (1e-6, 1e-2)
+    """smallest and largest learning rate; two equal numbers fix it"""
+    symmetric: bool = False
+    """treat left and right alike: a mirrored state gets the mirrored action (per task; docs/sapo.md)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
-        return super().task_defaults() | values | BALANCING.get(self.env, {})
+        own = {"symmetric": find_task(self.env).symmetric}
+        return super().task_defaults() | own | values | BALANCING.get(self.task, {})
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
 class ActorCritic(nn.Module):
-    """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features.
+    """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features."""
 
-    A mirror makes the policy symmetric.
-    """
-
-    def __init__(self, args: Args, env: DiffEnv, mirror: Mirror | None) -> None:
+    def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
-        self.normalizer = ObsNormalizer(obs_dim, mirror)
+        self.normalizer = ObsNormalizer(obs_dim)
         elu = partial(nn.ELU, inplace=True)
-        self.features = seeing(seen, mlp(seen or obs_dim, args.hidden, None, elu), mirror)
-        own = None if seen is None else mlp(obs_dim, args.hidden, None, elu)  # of V, which sees more
-        self.own = None if own is None else seeing(None, own, mirror)
-        mean, value = (nn.Sequential(nn.Linear(args.hidden[-1], n)) for n in (action_dim, 1))
-        self.mean, self.value = folded(mean, mirror and mirror.action), folded(value, mirror and mirror.value)
+        self.features = mlp(obs_dim, args.hidden, None, elu, columns=seen)
+        self.own = None if seen is None else mlp(obs_dim, args.hidden, None, elu)  # features of V, which sees more
+        self.mean, self.value = (nn.Sequential(nn.Linear(args.hidden[-1], n)) for n in (action_dim, 1))
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
-        make_even(self, "log_std", mirror)
+
+    def make_alike(self, mirror: Mirror) -> None:
+        """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
+        self.normalizer.mirror = mirror.obs
+        for features in (self.features, self.own):
+            if features is not None:
+                mirror_inputs(features, mirror.obs)
+        mirror_outputs(self.mean, mirror.action)
+        mirror_outputs(self.value, mirror.value)
+        make_symmetric(self, "log_std", mirror.action)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
@@ -121,7 +124,7 @@ class ActorCritic(nn.Module):
         return self.mean(features), self.value(features if self.own is None else self.own(obs)).squeeze(-1)
 
     def deterministic(self) -> nn.Sequential:
-        """The mean of raw observations, with the same weights."""
+        """Return the mean of raw observations, with the same weights."""
         return nn.Sequential(self.normalizer, *self.features, *self.mean)
 
 
@@ -152,26 +155,35 @@ class Batch(NamedTuple):
 
 
 class PPO:
-    """All that the next iteration depends on, and its two halves.
-
-    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
-    """
+    """What an iteration changes, and the iteration."""
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        mirror = env.task.mirror if args.symmetric else None
-        self.actor_critic = ActorCritic(args, env, mirror).to(env.device)
+        self.actor_critic = ActorCritic(args, env).to(env.device)
+        if args.symmetric:
+            self.actor_critic.make_alike(env.task.mirror)
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
-        self.optimizer = ClippedAdam(self.actor_critic, args.max_grad_norm, lr=args.lr)
-        samples, sizes = args.horizon * env.num_envs, ((obs_dim,), (action_dim,), (action_dim,), (), ())
-        self.batch = Batch(*(torch.zeros(samples, *size, device=env.device) for size in sizes))
-        self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
+        self.optimizer = ClippedAdam(self.actor_critic, MAX_GRAD_NORM, lr=args.lr)
+        self.minibatches = math.ceil(args.horizon * env.num_envs / args.minibatch_size * distributed.size())
+
+    def iterate(self) -> dict[str, Tensor]:
+        """Act for a rollout, and descend the clipped loss on its samples; returns metrics.
+
+        It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
+        """
+        samples, explained = self.act()
+        return {
+            "losses/explained_variance": explained,
+            "charts/std": self.actor_critic.log_std.detach().exp().mean(),
+            **self.learn(samples),
+            "grad/skipped": self.optimizer.skipped,
+            "charts/learning_rate": self.optimizer.lr,
+        }
 
     @torch.no_grad()
-    def collect(self) -> dict[str, Tensor]:
-        """Act for a rollout, and keep its samples with their advantages and value targets."""
+    def act(self) -> tuple[Batch, Tensor]:
+        """Act for a rollout: its samples, and the share of the returns' variance that their values explain."""
         args, policy, normalizer = self.args, self.actor_critic, self.actor_critic.normalizer
         noise = torch.randn(args.horizon, self.env.num_envs, policy.log_std.numel(), device=self.env.device)
         rollout = collect(self.env, policy, noise)
@@ -185,41 +197,40 @@ class PPO:
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
         samples = normalizer(rollout.obs), rollout.mean, rollout.action, advantage, target
-        for buffer, tensor in zip(self.batch, samples, strict=True):
-            buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(rollout.obs)
-        return {"charts/std": policy.log_std.exp().mean(), "losses/explained_variance": explained}
+        return Batch(*(tensor.flatten(0, 1) for tensor in samples)), explained
 
-    def update(self) -> dict[str, Tensor]:
+    def learn(self, samples: Batch) -> dict[str, Tensor]:
         """Descend the clipped loss (Eq. 7) in epochs of minibatches."""
-        args, policy, metrics = self.args, self.actor_critic, []
-        old_log_std = policy.log_std.detach().clone()
-        for _ in range(args.epochs):
-            order = torch.randperm(len(self.batch.obs), device=self.env.device)
-            for tensors in zip(*(tensor[order].chunk(self.minibatches) for tensor in self.batch), strict=True):
-                b = Batch(*tensors)
-                mean, value = policy(b.obs)
-                kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
-                adapt(self.optimizer.lr, distributed.average(kl), args.target_kl, args.lr_bounds)
-                ratio = log_ratio(b, mean, policy.log_std, old_log_std).exp()
-                policy_loss = clipped_loss(ratio, b.advantage, args.clip_coef)
-                value_loss = (value - b.target).square().mean()
-                bound_loss = (mean.abs() - 1.1).clamp(min=0).square().sum(-1).mean()
-                loss = policy_loss + args.value_coef * value_loss + args.bound_coef * bound_loss
-                bonus = entropy(policy.log_std)
-                clipped = ((ratio - 1).abs() > args.clip_coef).to(kl.dtype).mean()
-                norm = self.optimizer.step(loss - args.entropy_coef * bonus)
-                metrics.append(torch.stack((policy_loss, value_loss, bonus, kl, clipped, norm)).detach())
+        old_log_std, metrics = self.actor_critic.log_std.detach().clone(), []
+        for _ in range(self.args.epochs):
+            order = torch.randperm(len(samples.obs), device=self.env.device)
+            for tensors in zip(*(tensor[order].chunk(self.minibatches) for tensor in samples), strict=True):
+                metrics.append(self.update(Batch(*tensors), old_log_std))
         names = "losses/policy_loss losses/value_loss losses/entropy losses/approx_kl losses/clipfrac grad/norm".split()
-        return dict(zip(names, torch.stack(metrics).mean(0), strict=True)) | {
-            "grad/skipped": self.optimizer.skipped,
-            "charts/learning_rate": self.optimizer.lr,
-        }
+        return dict(zip(names, torch.stack(metrics).mean(0), strict=True))
+
+    def update(self, b: Batch, old_log_std: Tensor) -> Tensor:
+        """Take one step on a minibatch, with a learning rate that keeps the policy near the one that acted."""
+        policy, optimizer = self.actor_critic, self.optimizer
+        mean, value = policy(b.obs)
+        kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
+        adapt(optimizer.lr, distributed.average(kl), TARGET_KL, self.args.lr_bounds)
+        ratio = log_ratio(b, mean, policy.log_std, old_log_std).exp()
+        policy_loss = clipped_loss(ratio, b.advantage, CLIP)
+        value_loss = (value - b.target).square().mean()
+        bound_loss = (mean.abs() - BOUND).clamp(min=0).square().sum(-1).mean()
+        bonus = entropy(policy.log_std)
+        loss = policy_loss + VALUE_COEF * value_loss + BOUND_COEF * bound_loss - self.args.entropy_coef * bonus
+        gradient = optimizer.gradient(loss)
+        norm = optimizer.step(gradient)
+        clipped = ((ratio - 1).abs() > CLIP).to(kl.dtype).mean()
+        return torch.stack((policy_loss, value_loss, bonus, kl, clipped, norm)).detach()
 
 
 @torch.no_grad()
 def collect(env: DiffEnv, policy: ActorCritic, noise: Tensor) -> Rollout:
-    """H steps of all environments from where they stand, with standard normal noise (H, N, action_dim)."""
+    """Take H steps of all environments from where they stand, with standard normal noise (H, N, action_dim)."""
     steps = []
     obs, std = env.detach(), policy.log_std.exp()
     for step_noise in noise.unbind():
@@ -280,9 +291,9 @@ def train(args: Args) -> None:
     run = Run(args)
     env = run.make_env(args.num_envs, args.horizon)
     ppo = run.restore(PPO(args, env))
-    collect, update = run.capture(ppo.collect, env), run.capture(ppo.update)
+    iterate = run.capture(ppo.iterate, env)
     for _ in run:
-        run.log(collect() | update())
+        run.log(iterate())
         if run.evaluation_due:
             run.evaluate(ppo.policy)
 

@@ -24,10 +24,10 @@ from diffsim import DiffEnv
 from diffsim.extra.learning.ensemble import Ensemble
 from diffsim.extra.learning.replay import ReplayBuffer, Transition
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, mlp, seeing
+from diffsim.training.flags import Flags
+from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Batch, Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
+from diffsim.training.ranges import Batch, Count, Fraction, Natural, Positive, SomeWidths, UpTo10k, UpTo1000
 
 # Table 3 of the SHAC paper; networks, seed steps, hopper and half_cheetah: its authors' released settings.
 # fmt: off
@@ -47,59 +47,57 @@ LARGE_BATCH: dict[str, Any] = {"num_envs": 1024, "batch_size": 8192, "updates_pe
 LARGE_BATCH |= {"iterations": 800, "layer_norm": True, "gamma": 0.98, "tau": 0.05}
 CPU = {"num_envs": 64, "batch_size": 512, "updates_per_step": 2, "actor_updates": 1}  # of those, at most
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
+MAX_GRAD_NORM = 100.0  # few gradients reach it
+TARGET_ENTROPY = -1.0  # nats per action
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
     iterations: Count = 20_000
     """learning iterations: --steps control steps of all environments, each followed by updates (per task)"""
-    large_batch: bool = False
-    """many environments, large batches, layer-normalized critics: hopper, ant and humanoid in minutes of a GPU"""
+    eval_every: Natural = 500
+    """evaluate the policy without noise every this many iterations (0: only at the end)"""
+    save_every: Natural = 5000
+    """save the checkpoint, which holds the replay buffer, every this many iterations (0: only at the end)"""
+    num_envs: Count = 64
+    """parallel environments N (per task)"""
     steps: Count = 32
     """control steps of an iteration"""
-    updates_per_step: Repeats = 1
+    seed_steps: Natural = 640
+    """control steps of each environment with random actions before the first update (per task)"""
+    buffer_size: Count = 1_000_000
+    """transitions in the replay buffer, over all environments"""
+    updates_per_step: UpTo10k = 1
     """gradient updates of the critics after each control step of all environments"""
-    actor_updates: Repeats = 1
+    actor_updates: UpTo10k = 1
     """the last so many of these updates also update the actor and the temperature"""
     batch_size: Batch = 2048
     """samples of an update (per task)"""
-    buffer_size: Count = 1_000_000
-    """transitions in the replay buffer, over all environments"""
-    seed_steps: Natural = 640
-    """control steps of each environment with random actions before the first update (per task)"""
+    gamma: Fraction = 0.99
+    """discount factor"""
     hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
-    critics: Few = 2
+    critics: UpTo1000 = 2
     """value functions"""
-    critic_subset: Few = 2
+    critic_subset: UpTo1000 = 2
     """the target is the minimum of this many critics, drawn for each update"""
     layer_norm: bool = False
     """normalize the critics' hidden layers, which steadies many updates on large batches"""
-    actor_lr: Positive = 5e-4
-    """learning rate of the actor (per task)"""
     critic_lr: Positive = 5e-4
     """learning rate of the critics (per task)"""
-    temperature_lr: Positive = 5e-3
-    """learning rate of the temperature's logarithm (per task)"""
-    initial_temperature: Positive = 1.0
-    """initial weight of the entropy"""
-    target_entropy: Finite = -1.0
-    """target entropy per action, in nats"""
-    gamma: Fraction = 0.99
-    """discount factor"""
     tau: Fraction = 0.005
     """target critics <- (1 - tau) target critics + tau critics, after each update"""
-    max_grad_norm: Positive = 100.0
-    """gradients are clipped to this norm, which few reach"""
-    eval_every: Natural = 500
-    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
-    save_every: Natural = 5000
-    """save the checkpoint, which holds the replay buffer, every this many iterations (0: only at the end)"""
+    actor_lr: Positive = 5e-4
+    """learning rate of the actor (per task)"""
+    temperature_lr: Positive = 5e-3
+    """learning rate of the temperature's logarithm (per task)"""
+    large_batch: bool = False
+    """many environments, large batches, layer-normalized critics: hopper, ant and humanoid in minutes of a GPU"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
         if self.large_batch:
             values |= LARGE_BATCH | (CPU | {"iterations": 2000} if self.device == "cpu" else {})
         return values
@@ -128,7 +126,7 @@ class Actor(nn.Module):
         super().__init__()
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
+        self.body = mlp(obs_dim, args.hidden, None, nn.ReLU, columns=seen)
         self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -142,7 +140,7 @@ class Actor(nn.Module):
         return torch.tanh(u), density.sum(-1)
 
     def deterministic(self) -> nn.Sequential:
-        """The action without noise, of observations as they come, with the same weights."""
+        """Return the action without noise, of observations as they come, with the same weights."""
         return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
 
 
@@ -150,10 +148,7 @@ class Actor(nn.Module):
 
 
 class SAC:
-    """All that the next iteration depends on.
-
-    Its methods change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
-    """
+    """What an iteration changes, and the iteration."""
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
@@ -163,39 +158,47 @@ class SAC:
         critics = [mlp(inputs, args.hidden, 1, nn.ReLU, args.layer_norm) for _ in range(args.critics)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        log = torch.full((), math.log(args.initial_temperature))
-        self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
+        self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)  # the entropy's weight
         self.policy = self.actor.deterministic()
-        self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.actor_lr)
-        self.critic_optimizer = ClippedAdam(self.critics, args.max_grad_norm, lr=args.critic_lr)
-        self.temperature_optimizer = ClippedAdam(self.temperature, args.max_grad_norm, lr=args.temperature_lr)
+        self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.actor_lr)
+        self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.critic_lr)
+        self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
+
+    def iterate(self, learning: bool = True) -> dict[str, Tensor]:
+        """Algorithm 1: control steps of all environments into the buffer, each followed by updates; returns metrics.
+
+        Before learning begins, actions are random and nothing is updated. An iteration changes tensors in place and
+        never waits for the device, so that on a GPU it becomes one CUDA graph.
+        """
+        args, normalizer, rows = self.args, self.actor.normalizer, list[dict[str, Tensor]]()
+        obs = self.env.detach()
+        for _ in range(args.steps):
+            obs = self.act(obs, random=not learning)
+            for left in reversed(range(args.updates_per_step if learning else 0)):
+                batch = self.buffer.sample(args.batch_size)
+                seen, next_seen = normalizer(batch.obs), normalizer(batch.next_obs)
+                found = self.update_critics(batch, seen, next_seen)
+                if left < args.actor_updates:
+                    found |= self.update_actor(seen)
+            if learning:
+                rows.append(found)  # of each step's last update
+        optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
+        return {
+            **{name: torch.stack([row[name] for row in rows]).mean() for name in (rows[0] if rows else ())},
+            "grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum(),
+            "charts/actor_lr": self.actor_optimizer.lr,
+            "charts/critic_lr": self.critic_optimizer.lr,
+            "charts/temperature": self.temperature["log"].detach().exp(),
+        }
 
     def explore(self) -> dict[str, Tensor]:
         """An iteration of uniformly random actions, from which only the buffer and the normalizer learn."""
         return self.iterate(learning=False)
 
-    def learn(self) -> dict[str, Tensor]:
-        """An iteration: after each control step of all environments, the updates."""
-        return self.iterate(learning=True)
-
-    def iterate(self, learning: bool) -> dict[str, Tensor]:
-        """Control steps of all environments; when learning, those of the policy, each followed by updates."""
-        metrics = []
-        obs = self.env.detach()
-        for _ in range(self.args.steps):
-            obs = self.act(obs, random=not learning)
-            if learning:
-                metrics.append(self.update())
-        found = {name: torch.stack([row[name] for row in metrics]).mean() for name in (metrics[0] if learning else ())}
-        optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
-        found["grad/skipped"] = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
-        found |= {"charts/actor_lr": self.actor_optimizer.lr, "charts/critic_lr": self.critic_optimizer.lr}
-        return found | {"charts/temperature": self.temperature["log"].detach().exp()}
-
     @torch.no_grad()
     def act(self, obs: Tensor, random: bool) -> Tensor:
-        """One control step of all environments into the buffer; returns the observations after it."""
+        """Take a control step of all environments into the buffer; returns the observations after it."""
         env = self.env
         if random:
             action = 2 * torch.rand(env.num_envs, env.scene.nu, device=env.device) - 1
@@ -205,17 +208,6 @@ class SAC:
         self.buffer.add(Transition(obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
         self.actor.normalizer.update(obs)
         return next_obs
-
-    def update(self) -> dict[str, Tensor]:
-        """The updates of one control step."""
-        args = self.args
-        for left in reversed(range(args.updates_per_step)):
-            batch = self.buffer.sample(args.batch_size)
-            obs, next_obs = (self.actor.normalizer(x) for x in (batch.obs, batch.next_obs))
-            metrics = self.update_critics(batch, obs, next_obs)
-            if left < args.actor_updates:
-                metrics |= self.update_actor(obs)
-        return metrics
 
     def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
         """Descend the soft Bellman residual, and let the target critics follow."""
@@ -229,7 +221,7 @@ class SAC:
             target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
         values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
-        norm = self.critic_optimizer.step(loss)
+        norm = self.critic_optimizer.step(self.critic_optimizer.gradient(loss))
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             slow.lerp_(fast.detach(), args.tau)
         found = {"losses/critic": loss.detach() / args.critics, "charts/value": values.detach().mean()}
@@ -241,9 +233,10 @@ class SAC:
         values = self.critics.value(obs, action)
         value = values.amin(0) if self.args.critic_subset == self.args.critics else values.mean(0)  # REDQ: the mean
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
-        self.actor_optimizer.step(loss)
-        surplus = -density.detach().mean() - self.args.target_entropy * action.shape[1]  # of entropy over the target
-        self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
+        self.actor_optimizer.step(self.actor_optimizer.gradient(loss))
+        surplus = -density.detach().mean() - TARGET_ENTROPY * action.shape[1]  # of entropy over the target
+        weighted = self.temperature["log"].exp() * surplus
+        self.temperature_optimizer.step(self.temperature_optimizer.gradient(weighted))
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
 
 
@@ -254,9 +247,9 @@ def train(args: Args) -> None:
     run = Run(args)
     env = run.make_env(args.num_envs, args.steps)
     sac = run.restore(SAC(args, env))
-    explore, learn = run.capture(sac.explore, env), run.capture(sac.learn, env)
+    explore, iterate = run.capture(sac.explore, env), run.capture(sac.iterate, env)
     for iteration in run:
-        run.log(explore() if iteration * args.steps <= args.seed_steps else learn())
+        run.log(explore() if iteration * args.steps <= args.seed_steps else iterate())
         if run.evaluation_due:
             run.evaluate(sac.policy)
 

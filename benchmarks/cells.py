@@ -57,6 +57,15 @@ class Group(NamedTuple):
 GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
 
 
+STOPPING = """
+import runpy, sys
+from diffsim.training import Run
+Run.stop_after = int(sys.argv[1])
+del sys.argv[:2]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""  # a script, to an iteration
+
+
 @dataclass
 class ScriptFlags(common.CommonFlags):
     device: str = "auto"  # torch device of the learners (auto: the GPU if there is one)
@@ -78,14 +87,14 @@ class Runner:
         self.stop_at = math.inf if args.time_limit is None else time.monotonic() + args.time_limit
 
     def train(self, case: Case, until: int = 0) -> bool:
-        """From where it stands to an iteration, 0: the last; whether it got there."""
+        """Train from where it stands to an iteration, 0: the last; whether it got there."""
         start: list[object] = ["--env", case.env, "--seed", case.seed, "--run-dir", case.folder, "--quiet", *case.flags]
         if (path := case.folder / "checkpoint.pt").is_file():
             state = checkpoint.load(path)
             if state["iteration"] >= (until or state["args"]["iterations"]):
                 return True
             start = ["--resume", path]
-        return self._call(case, *start, "--stop-after", until, *self.args.arguments)
+        return self._call(case, *start, *self.args.arguments, until=until)
 
     def evaluate(self, case: Case) -> bool:
         """Evaluate the checkpoint, with finer steps as well, if that is not done; whether it is now."""
@@ -93,14 +102,15 @@ class Runner:
         done = "finer" in evaluation(case.folder, iteration)
         return done or self._call(case, "--evaluate", path, "--run-dir", case.folder)
 
-    def _call(self, case: Case, *arguments: object) -> bool:
+    def _call(self, case: Case, *arguments: object, until: int = 0) -> bool:
         """Whether the script came to its end. It is stopped, and saves, when the time is up."""
         left = self.stop_at - time.monotonic()
         if left <= 0:
             return False
         script, _, ranks = case.script.partition("@")
         torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}", "--"] if ranks else []
-        command = [sys.executable, *torchrun, str(ROOT / f"{script}.py"), *map(str, arguments)]
+        stopping = ["-c", STOPPING, str(until)] if until else []
+        command = [sys.executable, *torchrun, *stopping, str(ROOT / f"{script}.py"), *map(str, arguments)]
         command += ["--device", self.args.device]
         case.folder.mkdir(parents=True, exist_ok=True)
         with (case.folder / "output.txt").open("a") as output:

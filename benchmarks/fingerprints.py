@@ -52,7 +52,7 @@ CASES = {  # small trainings
     "joystick": "shac --env go2 --num-envs 16",
     "fast": "shac --env half_cheetah --accuracy fast --num-envs 16",
 }
-SMALL = "--device {} --threads 1 --iterations 4 --stop-after 3 --eval-every 0 --quiet"
+SMALL = "--device {} --threads 1 --iterations 3 --eval-every 0 --eval-episodes 1 --quiet"
 TRAIN_AND_HASH = """
 import hashlib, runpy, sys, torch
 del sys.argv[0]

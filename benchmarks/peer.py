@@ -152,9 +152,13 @@ def train(args: Args, name: Name) -> Iterator[Row]:
     env = training.make_env(settings.num_envs, settings.horizon)
     env.sim = peer = MuJoCoWarp(env.sim, name)
     ppo = training.restore(ppo_baseline.PPO(settings, env))
-    update = training.capture(ppo.update)
+    count, sizes = settings.horizon * env.num_envs, ((env.task.obs_dim,), (env.scene.nu,), (env.scene.nu,), (), ())
+    samples = ppo_baseline.Batch(*(torch.zeros(count, *size, device=env.device) for size in sizes))
+    learn = training.capture(lambda: ppo.learn(samples))
     for iteration in training:
-        training.log(ppo.collect() | update() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
+        for kept, part in zip(samples, ppo.act()[0], strict=True):
+            kept.copy_(part)
+        training.log(learn() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
         if training.seconds >= args.seconds:
             training.last = settings.iterations = iteration
     last = read_csv(training.directory / "progress.csv")[-1]

@@ -32,14 +32,14 @@ STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_s
 
 
 def check_seed(seed: int) -> int:
-    """The seed as an int, be it NumPy's; raises ValueError unless it is an integer of 64 bits. True is none."""
+    """Return the seed as an int; raises ValueError unless it is an integer of 64 bits, which True is not."""
     if not isinstance(seed, Integral) or isinstance(seed, bool) or not -(2**63) <= seed < 2**63:
         raise ValueError(f"seed is {seed!r}, must be one integer of 64 bits; a NumPy vector environment takes one each")
     return int(seed)
 
 
 class ActionError(ValueError):
-    """An action that is not a number: the policy that took it has diverged."""
+    """Raised when a policy outputs NaN."""
 
 
 class DiffEnv(VectorEnv):
@@ -84,7 +84,7 @@ class DiffEnv(VectorEnv):
         render_mode: Literal["rgb_array"] | None = None,
         **options: Any,
     ) -> None:
-        task = copy.copy(task)  # of another ground than that of other environments
+        task = copy.copy(task)  # its ground is this environment's
         task.ground = None
         self.task, self.scene, self.control_dt = task.bind(scene), scene, task.control_dt
         how = integration or task.integration("default")
@@ -119,13 +119,14 @@ class DiffEnv(VectorEnv):
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
-        self.qpos, self.qvel, self._obs, self.memory = self._draw(1)[0]
+        self.qpos, self.qvel, self._obs, self.memory = self._draw_starts(1)[0]
         self._pinned: State | None = None
-        self._starts, self._time = self._draw(horizon), 0  # of the window: one batch of operations, not one per step
+        # Start states of the whole window: one batch of operations, not one per step
+        self._starts, self._time = self._draw_starts(horizon), 0
 
     @property
     def np_random_seed(self) -> int:
-        """The seed of `generator`."""
+        """Return the seed of `generator`."""
         return self.generator.initial_seed()
 
     @in_plain_mode
@@ -139,19 +140,19 @@ class DiffEnv(VectorEnv):
             raise ValueError(f"options are {options!r}, but reset takes none")
         if seed is not None:
             self.generator.manual_seed(check_seed(seed))
-        self._cut()
-        self._begin(torch.ones_like(self.episode_step, dtype=torch.bool), self._draw(1)[0])
+        self._detach_state()
+        self._start_episodes(torch.ones_like(self.episode_step, dtype=torch.bool), self._draw_starts(1)[0])
         if self._pinned is not None:
-            self.carry_over(self._pinned)
+            self.write_back(self._pinned)
         if self.device.type == "cuda":  # the next step draws start states, as it does in each replay of a graph
             self._time = self.horizon
         else:
-            self._starts, self._time = self._draw(self.horizon), 0
+            self._starts, self._time = self._draw_starts(self.horizon), 0
         return self._obs.clone(), {}
 
     @in_plain_mode
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """One control step of all environments, and the reset of those that end.
+        """Take one control step in all environments, and reset those that end.
 
         Args:
             action: (N, nu), clipped to [-1, 1].
@@ -168,13 +169,13 @@ class DiffEnv(VectorEnv):
         """
         _, reward, terminated, truncated, info = self.advance(action)
         if self._time == self.horizon:
-            self._starts, self._time = self._draw(self.horizon), 0
-        self._begin(info["_final_obs"], self._starts[self._time])
+            self._starts, self._time = self._draw_starts(self.horizon), 0
+        self._start_episodes(info["_final_obs"], self._starts[self._time])
         self._time += 1
         return self._obs.clone(), reward, terminated, truncated, info
 
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """`step` without the reset: obs is info["final_obs"], and ended episodes wait for `reset`."""
+        """Do what `step` does except the reset: obs is info["final_obs"], and ended episodes wait for `reset`."""
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
@@ -204,15 +205,15 @@ class DiffEnv(VectorEnv):
         info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
         return obs, reward, terminated, truncated, info
 
-    def _begin(self, mask: Tensor, starts: State) -> None:
+    def _start_episodes(self, mask: Tensor, starts: State) -> None:
         """Start new episodes in the environments of a mask (N,); gradients of the others stay as they are."""
         row = mask.unsqueeze(1)
-        self._put(torch.where(row, start, now) for start, now in zip(starts, self._state(), strict=True))
+        self._set_state(torch.where(row, start, now) for start, now in zip(starts, self._state(), strict=True))
         self.episode_step.masked_fill_(mask, 0)
         self._episode_return.masked_fill_(mask, 0.0)
 
     def render(self) -> Frames:
-        """A frame (height, width, 3) of each environment.
+        """Draw a frame (height, width, 3) of each environment.
 
         Raises:
             RuntimeError: made without render_mode; no OpenGL.
@@ -231,35 +232,35 @@ class DiffEnv(VectorEnv):
     @in_plain_mode
     def detach(self) -> Tensor:
         """Cut the graph at the current state, begin a window there, and return observations (N, obs_dim)."""
-        self._cut()
-        self._starts, self._time = self._draw(self.horizon), 0
+        self._detach_state()
+        self._starts, self._time = self._draw_starts(self.horizon), 0
         return self._obs.clone()
 
-    def _cut(self) -> None:
-        self._put(part.detach() for part in self._state())
+    def _detach_state(self) -> None:
+        self._set_state(part.detach() for part in self._state())
         self.sim.rewind()
 
-    def pin(self) -> State:
+    def pin_window(self) -> State:
         """Copy the state into fixed buffers, from which a CUDA graph replays the window; see graph.py."""
-        self._put(part.detach().clone() for part in self._state())
+        self._set_state(part.detach().clone() for part in self._state())
         self._pinned = self._state()
         return self._pinned
 
-    def carry_over(self, start: State) -> None:
-        """End a captured window: write the state back to where it started, as returned by `pin`."""
+    def write_back(self, pinned: State) -> None:
+        """End a captured window: write the state back into the buffers that `pin_window` returned."""
         with torch.no_grad():
-            for to, value in zip(start, self._state(), strict=True):
+            for to, value in zip(pinned, self._state(), strict=True):
                 to.copy_(value)
-        self._put(start)
+        self._set_state(pinned)
 
     def _state(self) -> State:
         return self.qpos, self.qvel, self._obs, self.memory
 
-    def _put(self, state: Iterable[Tensor]) -> None:
+    def _set_state(self, state: Iterable[Tensor]) -> None:
         self.qpos, self.qvel, self._obs, self.memory = state
 
     def take_statistics(self) -> dict[str, Tensor]:
-        """What happened since the last call, as () tensors; the device is not waited for.
+        """Return what happened since the last call, as () tensors, without waiting for the device.
 
         Returns:
             "episodes": how many ended; "return" and "length": sums over them; "nonfinite": environments that blew up;
@@ -295,13 +296,13 @@ class DiffEnv(VectorEnv):
         return self._obs.clone()
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """The task's observation (N, obs_dim) of states, with its memory."""
+        """Return the task's observation (N, obs_dim) of states, with its memory."""
         if self.task.ground is not None:
             qpos = self.task.ground.lower(qpos)
         return self.task.observe_with(qpos, qvel, action, self.memory)
 
     def state_dict(self) -> dict[str, Any]:
-        """A dictionary that continues the episodes exactly, without the simulator's factors and forces."""
+        """Return a dictionary that continues the episodes exactly, without the simulator's factors and forces."""
         names = ("qpos", "qvel", "obs", "memory", "episode_step", "episode_return")
         parts = zip(names, (*self._state(), self.episode_step, self._episode_return), strict=True)
         tensors = {name: part.detach().clone() for name, part in parts if name != "memory" or self.task.num_memory}
@@ -318,15 +319,15 @@ class DiffEnv(VectorEnv):
             if theirs != ours:
                 raise ValueError(f"the state's {name} is {theirs}; this environment's is {ours}")
         state = {"memory": self.memory} | state
-        self._put(state[name].to(self.device, copy=True) for name in ("qpos", "qvel", "obs", "memory"))
+        self._set_state(state[name].to(self.device, copy=True) for name in ("qpos", "qvel", "obs", "memory"))
         self.episode_step.copy_(state["episode_step"])
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
         self._time = self.horizon
 
     @torch.no_grad()
-    def _draw(self, steps: int) -> list[State]:
-        """Start states of all environments, so many each."""
+    def _draw_starts(self, steps: int) -> list[State]:
+        """Draw start states of all environments for a number of steps."""
         rand = self._uniform(steps, self.num_envs, self.task.num_random)
         if not self.stochastic_init:
             rand.fill_(0.5)

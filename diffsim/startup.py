@@ -1,4 +1,4 @@
-"""MuJoCo and Warp, started without noise. The package imports this before everything else; its host stays as it was."""
+"""Start MuJoCo and Warp without messages. The package imports this before everything else."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pathlib import Path
 
 import warp as wp
 
-ROOM = 16 * 2**20  # bytes that a kernel takes in Warp's cache at most; LLVM aborts the process when there are fewer
+ROOM = 16 * 2**20  # largest size of a kernel in Warp's cache, bytes; with less space LLVM aborts the process
 _started, _starting = False, threading.Lock()
 _announced: set[str] = set()
 
 
 class KernelCacheError(ValueError):
-    """Warp's folder of compiled kernels cannot be written."""
+    """Raised when Warp's folder of compiled kernels cannot be written."""
 
     def __init__(self, folder: object, error: OSError) -> None:
         super().__init__(
@@ -30,9 +30,9 @@ class KernelCacheError(ValueError):
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo even where MUJOCO_GL names an OpenGL that is not there: only drawing needs it, and says so.
+    """Import MuJoCo, also if MUJOCO_GL names an OpenGL that is missing: only drawing needs it, and reports it.
 
-    Its warnings go to stderr, unless the host already has another place for them.
+    MuJoCo's warnings go to stderr, unless the host program has set another handler.
     """
     try:
         importlib.import_module("mujoco")
@@ -51,7 +51,7 @@ def import_mujoco() -> None:
 
 
 def start_warp() -> None:
-    """Start Warp if there is no NVIDIA driver, without the warning that it prints then, from C.
+    """Start Warp if there is no NVIDIA driver, without the warning that its C code then prints.
 
     With a driver there is no warning, and Warp starts when it is first used: CUDA must not begin at an import.
     """
@@ -64,7 +64,7 @@ def start_warp() -> None:
 
 
 def nvidia_driver() -> bool:
-    """Whether the library of the NVIDIA driver can be loaded."""
+    """Tell whether the library of the NVIDIA driver can be loaded."""
     for name in ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so", "libcuda.so.1"):
         try:
             ctypes.CDLL(name)
@@ -75,7 +75,7 @@ def nvidia_driver() -> bool:
 
 
 def check_kernel_cache() -> Path:
-    """Start Warp; the folder where it keeps compiled kernels. Raises KernelCacheError if it cannot be written."""
+    """Start Warp, return its folder of compiled kernels; raises KernelCacheError if that cannot be written."""
     global _started
     wanted = wp.config.kernel_cache_dir
     try:
@@ -93,7 +93,7 @@ def check_kernel_cache() -> Path:
 
 
 def load(module: wp.Module, device: str, block_dim: int, name: str) -> None:
-    """Load a module of kernels. One that the cache lacks, or has damaged, is compiled, which one line on stderr says.
+    """Load a module of kernels; if it is missing in the cache or damaged there, compile it with one line on stderr.
 
     Raises:
         KernelCacheError: the cache cannot be written, or what was compiled cannot be loaded from there.
@@ -119,7 +119,7 @@ def load(module: wp.Module, device: str, block_dim: int, name: str) -> None:
 
 @contextmanager
 def quick_kernels() -> Iterator[None]:
-    """Kernels that are compiled meanwhile take half as long for it, and run at a fifth of the speed."""
+    """Compile in half the time kernels that run at a fifth of the speed."""
     config = wp.config
     before = config.optimization_level, config.use_precompiled_headers
     config.optimization_level, config.use_precompiled_headers = 0, False  # headers are compiled for several modules
@@ -131,7 +131,7 @@ def quick_kernels() -> Iterator[None]:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Hold back what is written to stderr, by C as well; what fails raises an error."""
+    """Discard what is written to stderr, by C as well; failures still raise."""
     try:
         stderr = os.dup(2)
     except OSError:  # closed

@@ -7,7 +7,8 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffsim.training import command
+from diffsim.training import Run, command
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
@@ -34,18 +35,26 @@ SMALL = {
 SCRIPTS = {name: importlib.import_module(name) for name in SMALL}
 
 
-def run(script: ModuleType, directory: Path, *arguments: object) -> dict[str, Any]:
+@contextmanager
+def stopped(after: int) -> Iterator[None]:
+    """Let runs stop after an iteration; 0: at their end."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Run, "stop_after", after)
+        yield
+
+
+def run(script: ModuleType, directory: Path, *arguments: object, stop_after: int = 0) -> dict[str, Any]:
     """Trains in directory; returns the checkpoint."""
-    script.main([*map(str, arguments), "--run-dir", str(directory)])
+    with stopped(stop_after):
+        script.main([*map(str, arguments), "--run-dir", str(directory)])
     return torch.load(directory / "checkpoint.pt", weights_only=True)
 
 
 def assert_resumes(script: ModuleType, directory: Path, flags: str, stop_after: int) -> dict[str, Any]:
     """A training that stops and goes on ends bitwise as one that does not; returns the checkpoint of `whole`."""
     whole = run(script, directory / "whole", *flags.split())
-    run(script, directory / "part", *flags.split(), "--stop-after", stop_after)
-    again = "--resume", directory / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet"
-    part = run(script, directory / "part", *again)
+    run(script, directory / "part", *flags.split(), stop_after=stop_after)
+    part = run(script, directory / "part", "--resume", directory / "part" / "checkpoint.pt", "--quiet")
     for name in ("modules", "ranks", "iteration", "control_steps"):
         assert_same(part[name], whole[name])
     return whole

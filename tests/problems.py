@@ -126,7 +126,8 @@ def assert_soft_updates(
 
     losses: list[Tensor] = []
     for optimizer in optimizers:
-        monkeypatch.setattr(optimizer, "step", losses.append)
+        monkeypatch.setattr(optimizer, "gradient", lambda loss: losses.append(loss) or loss)
+        monkeypatch.setattr(optimizer, "step", lambda loss: loss)
     state = torch.get_rng_state()
     learner.update_actor(obs)
     torch.set_rng_state(state)

@@ -283,7 +283,7 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "drag": r"\(var_m\)\.drag_\w+\b",
     "floating": r"\bquat_(?!t\b)\w+\(",  # or a ball; every ball here is on a floating base
     "terrain": r"\(var_m\)\.(terrain|carrier_along)\b|\bnearest_of_each",
-    "varied": r"\bcontact_constants_adjoint|\blimit_constants_gain|\(var_m\)\.carried\b",
+    "varied": r"\bcontact_constants_adjoint|\blimit_constants_derivatives|\(var_m\).owned\b",
     "forced": r"\badd_forces|\(var_m\)\.body_com\b",
 }
 

@@ -325,7 +325,7 @@ def of_argparse(script: Path) -> set[str]:
 
 
 ANY = {flag for script in SCRIPTS for flag in flags(script)}
-ANY |= {flag for path in ("__main__.py", "tune/__init__.py") for flag in of_commands(ROOT / "diffsim" / path)}
+ANY |= {flag for path in ("commands.py", "tune/__init__.py") for flag in of_commands(ROOT / "diffsim" / "extra" / path)}
 
 
 def commands(page: Path) -> Iterator[list[str]]:

@@ -324,7 +324,9 @@ def test_other_derivatives_than_backward_are_refused(kind):
     env = diffsim.make("hopper", num_envs=2, horizon=2)
     qpos, action = env.qpos, torch.zeros(2, 3)
     message = (
-        "first derivative only, so no create_graph" if kind == "create_graph" else "by backward.*Simulator.jacobians"
+        "first derivative only, so no create_graph"
+        if kind == "create_graph"
+        else "supports backward.*Simulator.jacobians"
     )
     for step in (lambda a: env.step(a)[1].sum(), lambda a: env.sim.step(qpos, env.qvel.detach(), a)[1].sum()):
         env.sim.step(qpos, env.qvel.detach(), action)  # a first one prepares its kernels

@@ -176,9 +176,9 @@ def test_one_lane_counts_each_joint_and_has_each_body(team):
     division, count = divide(scene, *team), np.zeros(scene.nlink)
     model = model_of(scene, division, wp.float64, "cpu")
     begin, body, link = model.body_begin.numpy(), model.body.numpy(), model.link.numpy()
-    np.add.at(count, link, model.carried.numpy())
+    np.add.at(count, link, model.owned.numpy())
     assert (count[1:] == 1).all()
     assert sorted(body) == list(range(1, scene.nbody))
     for entry, (first, end) in enumerate(zip(begin, begin[1:], strict=False)):
         assert (scene.body_link[body[first:end]] == link[entry]).all()
-        assert first == end or link[entry] in division.weighs[entry // division.slots]
+        assert first == end or link[entry] in division.masses[entry // division.slots]

@@ -257,7 +257,7 @@ def test_densities_of_the_set_are_those_of_its_generators(search: gps.Search) ->
 
 def test_resume_continues_exactly(trained: Path, tmp_path: Path, checkpoint: dict[str, Any]) -> None:
     """Also where it saves and evaluates more often."""
-    run(gps, tmp_path, *SMALL, "--stop-after", 2, "--save-every", 1, "--eval-every", 1)
+    run(gps, tmp_path, *SMALL, "--save-every", 1, "--eval-every", 1, stop_after=2)
     gps.main(["--resume", str(tmp_path / "checkpoint.pt")])
     resumed = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     for name in checkpoint.keys() - {"seconds", "args"}:

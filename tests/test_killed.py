@@ -17,6 +17,8 @@ import pytest
 import torch
 from learners import PATH, ROOT, assert_same, read_progress
 
+from diffsim.training import Run
+
 pytestmark = pytest.mark.slow
 COMMON = "--env cartpole --device cpu --iterations 6 --eval-every 4 --eval-episodes 2 --quiet --threads 1"
 WINDOWS = "--env cartpole:motor=0.7:1.3,mass=0.5:2 --num-envs 6 --horizon 16"
@@ -62,12 +64,13 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return request.param, load(directory)
 
 
-def train(script: str, directory: Path, *more: object) -> None:
+def train(script: str, directory: Path, stop_after: int = 0) -> None:
     main, path = importlib.import_module(script).main, directory / "checkpoint.pt"
     new = [*COMMON.split(), *FLAGS[script].split(), "--run-dir", directory]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [f"{script}.py"])
-        main([*map(str, ["--resume", path, "--stop-after", 0] if path.exists() else new), *map(str, more)])
+        patch.setattr(Run, "stop_after", stop_after)
+        main([*map(str, ["--resume", path] if path.exists() else new)])
 
 
 @pytest.mark.parametrize("case", ["elsewhere", "each", "moved"])
@@ -83,7 +86,7 @@ def test_a_run_that_is_stopped_and_resumed_ends_bitwise_alike(
         assert start(script, *flags, cwd=tmp_path, env=other).wait() == 0
     else:
         for stop in {"each": range(1, 6), "moved": [2]}[case]:
-            train(script, directory, "--stop-after", stop)
+            train(script, directory, stop)
         directory = directory.rename(tmp_path / "moved ü") if case == "moved" else directory
         train(script, directory)
     for name in COMPARED:

@@ -24,7 +24,7 @@ def test_everything_is_dealt_once(name: str, team: tuple[int, int]) -> None:
     d = divide(scene, *team)
     muscles = sorted(set(scene.segment_muscle))
     for hands, things in (
-        (d.weighs, range(scene.nlink)),
+        (d.masses, range(scene.nlink)),
         (d.spheres, range(len(scene.contact_link))),
         (d.muscles, muscles),
     ):
@@ -34,7 +34,7 @@ def test_everything_is_dealt_once(name: str, team: tuple[int, int]) -> None:
         has = set(links)
         assert links[: d.trunk + 1] == trunk and links[d.trunk + 1 :] == sorted(has - set(trunk))
         assert all(scene.parent[i] in has for i in links)
-        assert has >= set(d.weighs[lane]) | {scene.contact_link[k] for k in d.spheres[lane]}
+        assert has >= set(d.masses[lane]) | {scene.contact_link[k] for k in d.spheres[lane]}
         for k in d.muscles[lane]:
             assert has >= set(scene.segment_link[scene.segment_muscle == k].flatten())
         # A limb belongs to the sharers of one group alone.

@@ -73,9 +73,10 @@ def test_elites_predict_and_no_others() -> None:
 def learner_of(flags: str) -> mbpo.MBPO:
     torch.manual_seed(0)
     common = "--hidden 32 32 --model-hidden 32 32 --num-envs 20 --steps 8 --batch-size 128 --actor-lr 3e-3"
-    common += " --gamma 0.9 --temperature-lr 1e-12 --tau 0.05 --model-lr 3e-3 --model-updates 20"
+    common += " --gamma 0.9 --temperature-lr 1e-12 --model-updates 20"
     common += " --model-batch-size 64 --branches 50"
     learner = build(*common.split(), *flags.split(), env=Problem(20))
+    learner.model_optimizer.lr.fill_(3e-3)
     for _ in range(10):
         learner.explore()
     return learner
@@ -110,8 +111,8 @@ def test_the_best_on_held_out_transitions_become_elites(monkeypatch: pytest.Monk
         learner.fit()
     last, step = learner.models.ensemble.layers[-1], learner.model_optimizer.step
 
-    def spoiling(loss: Tensor) -> Tensor:
-        norm = step(loss)
+    def spoiling(gradient: Tensor) -> Tensor:
+        norm = step(gradient)
         with torch.no_grad():
             last.bias[[0, 2, 3, 6], :, :2] = 3.0
         return norm
@@ -140,7 +141,8 @@ def test_held_out_environments_are_not_learnt_from() -> None:
 
 def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Real states are -1; each step adds 1; what passes 2 has failed; the length rises over half of the iterations."""
-    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
+    monkeypatch.setattr(mbpo, "RETAIN", 1)
+    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --elites 5")
     learner.real.rows[:, 0] = -1.0
     learner.env.task.terminated = lambda obs: obs[:, 0] > 2.5
     monkeypatch.setattr(learner.models, "predict", lambda obs, action: (torch.ones(250, 1), action[:, 0]))
@@ -154,15 +156,6 @@ def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatc
         torch.testing.assert_close(rows.next_obs, rows.obs + 1)
         torch.testing.assert_close(rows.terminated, (rows.obs == 2).squeeze(1).float())
         torch.testing.assert_close(rows.reward, rows.action.squeeze(1))
-
-
-def test_without_early_termination_no_rollout_fails() -> None:
-    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
-    learner.env.task.terminated = lambda obs: torch.ones_like(obs[:, 0], dtype=torch.bool)
-    for early in (True, False):
-        learner.args.early_termination = early
-        learner.imagine()
-        assert (learner.imagined.split(learner.imagined.rows).terminated == early).all()
 
 
 def test_an_update_has_its_share_of_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,8 +241,9 @@ def test_targets_and_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_soft_updates(learner, (learner.actor_optimizer, learner.temperature_optimizer), monkeypatch)
 
 
-def test_a_linear_quadratic_system_is_controlled() -> None:
+def test_a_linear_quadratic_system_is_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
     """From rollouts of the models alone, which have learnt from random actions."""
+    monkeypatch.setattr(mbpo, "TAU", 0.05)
     learner = learner_of("--real-ratio 0 --updates 10 --model-updates 80")
     learner.temperature["log"].data.fill_(math.log(0.1))
     for _ in range(10):
@@ -278,10 +272,10 @@ def test_nothing_captured_waits_for_the_device() -> None:
 
 def test_a_run_resumes_bitwise_with_its_buffers(tmp_path: Path) -> None:
     flags = "--env cartpole --num-envs 4 --steps 8 --seed-steps 16 --batch-size 16 --hidden 16 --model-hidden 16 "
-    flags += "--model-updates 3 --updates 3 --branches 8 --buffer-size 300 --retain 2 --iterations 8 --quiet "
+    flags += "--model-updates 3 --updates 3 --branches 8 --buffer-size 300 --iterations 8 --quiet "
     flags += "--sample-enhance 2 --model-batch-size 16 --eval-episodes 2 --device cpu --threads 1"
     whole = assert_resumes(mbpo, tmp_path, flags, 5)
     sizes = [len(whole["modules"][name]["_extra_state"]) for name in ("real", "unseen", "imagined")]
-    assert sizes == [300, 30, 400]
+    assert sizes == [300, 30, 800]
     first, *_, last = read_progress(tmp_path / "part")
     assert first["losses_critic"] == "" and float(last["models_holdout_mse"]) > 0 and last["models_train_nll"]

@@ -26,7 +26,7 @@ COMMANDS = [
 ]
 LEARNER = "ppo_baseline.py"
 TINY = "--num-envs 4 --horizon 8 --minibatch-size 16 --epochs 1".split()
-FEW = "--eval-episodes 2 --eval-every 0 --device cpu --no-finer".split()
+FEW = "--eval-episodes 2 --eval-every 0 --device cpu".split()
 
 
 @pytest.fixture(scope="module")

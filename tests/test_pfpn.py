@@ -329,8 +329,7 @@ def build(kind: Any, flags: str, reward: Callable[[Tensor, Tensor], Tensor], env
 
 def solve(learner: Any, iterations: int) -> Any:
     for _ in range(iterations):
-        learner.interact()
-        learner.learn()
+        learner.iterate()
     return learner
 
 
@@ -374,10 +373,11 @@ def test_ppo_bandit_stays_on_both_peaks_with_entropy() -> None:
     assert min(masses(learner.actor)) > 0.2 and learner.resampling.moved > 0
 
 
-def test_sac_bandit_has_its_soft_optimum() -> None:
+def test_sac_bandit_has_its_soft_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """The policy proportional to exp(r / alpha), which has two peaks of unequal height."""
     flags = "--horizon 8 --num-envs 16 --minibatch-size 128 --critic-hidden 64 --particles 15"
-    flags += " --lr 4e-3 --temperature-lr 1e-9 --tau 0.05 --buffer-size 5000"
+    flags += " --lr 4e-3 --temperature-lr 1e-9 --buffer-size 5000"
+    monkeypatch.setattr(pfpn_sac, "TAU", 0.05)
 
     def reward(_: Tensor, action: Tensor) -> Tensor:
         return 2 * (action + 0.6).square() - 2 * torch.cos(5 * (action + 0.6))
@@ -403,8 +403,7 @@ def test_skipped_updates_are_those_of_all_optimizers() -> None:
     flags = "--num-envs 8 --critic-hidden 4 --minibatch-size 8 --buffer-size 64"
     learner = build(pfpn_sac.SAC, flags, lambda _, action: action, 8, steps=3)
     learner.temperature_optimizer.skip_norm = 0.0
-    learner.interact()
-    assert learner.learn()["grad/skipped"] == 3
+    assert learner.iterate()["grad/skipped"] == 3
 
 
 def test_locations_beyond_the_bounds_are_drawn_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 import diffsim
 import pods
-from diffsim.extra.export import export_policy
+from diffsim import DiffEnv
 from diffsim.sim.simulator import Simulator
 from diffsim.training import parse
 
@@ -166,24 +166,26 @@ def test_imitation_recovers_a_gain_and_leaves_broken_sequences_out(rng: np.rando
     gain = torch.tensor([0.5, -0.3, 0.2, 0.0, -0.4])
     action = torch.tanh(obs @ gain).unsqueeze(-1)
     action[:, 2] = 1.0  # nonsense, of a sequence that is left out
-    learner.lessons = obs, action, torch.tensor([True, True, False])
-    first = learner.imitate()["losses/first_epoch"]
-    last = learner.imitate()["losses/imitation"]
+    lessons = obs, action, torch.tensor([True, True, False])
+    first = learner.imitate(*lessons)["losses/first_epoch"]
+    last = learner.imitate(*lessons)["losses/imitation"]
     error = (learner.policy(obs[:, :2]) - action[:, :2]).square().mean().item()
     assert error < 2e-3 and last < 0.1 * first
     assert last.item() == pytest.approx(0.5 * error, rel=0.7)
 
 
 @pytest.mark.parametrize("where", ["visited", "improved"])
-def test_an_iteration_teaches_the_improved_actions(where: str) -> None:
+def test_an_iteration_teaches_the_improved_actions(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """An episode's end within a sequence leaves that sequence out, and no other."""
     torch.manual_seed(0)
     learner = build("--horizon", "40", "--imitate", where, "--improvements", "2", "--candidates", "6")
     env = learner.env
     env.episode_step[1] = env.episode_length - 10
     start = pods.Start(env.qpos, env.qvel, env.detach())
-    metrics = learner.improve()
-    obs, action, whole = learner.lessons
+    lessons = list[tuple[Tensor, ...]]()
+    monkeypatch.setattr(learner, "imitate", lambda *given: lessons.append(given) or {})
+    metrics = learner.iterate()
+    ((obs, action, whole),) = lessons
     assert whole.tolist() == [True, False, True] and metrics["pods/left_out"] == pytest.approx(1 / 3)
     assert learner.control_steps == 3 * 40 * (1 + 2 * (1 + 6))
     trials = Simulator(env.scene, 3, env.sim.integration, env.control_dt)
@@ -220,13 +222,17 @@ def test_first_order_learns_to_swing(tmp_path: Path) -> None:
     assert float(rows[0]["return"]) < -2200 and float(rows[-1]["eval_return"]) > -2000
 
 
-def test_tasks_without_early_termination(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The ant keeps its episode of whole length, in training and evaluation, on the ground as well."""
-    flags = (
-        "--env ant --no-early-termination --num-envs 2 --horizon 4 --iterations 2 --hidden 16 --candidates 2 --quiet"
-    )
-    run(pods, tmp_path, *flags.split(), "--eval-every", 0, "--eval-episodes", 2, "--stop-after", 1)
-    export_policy(tmp_path / "checkpoint.pt", tmp_path / "policy.pt")
-    for name in ("checkpoint.pt", "policy.pt"):
-        pods.main(["--evaluate", str(tmp_path / name), "--no-finer", "--eval-episodes", "2"])
-        assert "length 1000.0" in capsys.readouterr().out
+def test_sequences_of_an_ant_are_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its falls do not end them, except in evaluations."""
+    made, init = list[DiffEnv](), pods.PODS.__init__
+
+    def record(self: pods.PODS, args: pods.Args, env: DiffEnv) -> None:
+        made.append(env)
+        init(self, args, env)
+
+    monkeypatch.setattr(pods.PODS, "__init__", record)
+    flags = "--env ant --num-envs 2 --horizon 4 --iterations 2 --hidden 16 --candidates 2 --eval-episodes 2 --quiet"
+    run(pods, tmp_path, *flags.split(), "--eval-every", 0, stop_after=1)
+    (env,) = made
+    obs = env.set_state(env.qpos * torch.tensor([1.0, 1.0, 0.1] + 12 * [1.0]), env.qvel)
+    assert env.task.terminated(obs).all() and not env.step(torch.zeros(2, 8))[2].any()

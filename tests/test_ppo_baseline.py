@@ -59,7 +59,7 @@ def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
         return made[-1][0]
 
     monkeypatch.setattr(ppo, "collect", recorded)
-    learner.collect()
+    batch, _ = learner.act()
     ((rollout, noise),) = made
     truncated = rollout.done & ~rollout.terminated
     assert truncated.nonzero().tolist() == [[3, 1]] and rollout.terminated.any(0).tolist() == [False, False, True]
@@ -75,7 +75,6 @@ def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
     value, next_value = returns.inverse(value), returns.inverse(next_value).masked_fill(rollout.terminated, 0.0)
     advantage = ppo.gae(rollout.reward, value, next_value, rollout.done, args.gamma, args.gae_lambda)
     returns.update(value + advantage)
-    batch = learner.batch
     torch.testing.assert_close(batch.obs, normalizer(rollout.obs).flatten(0, 1))
     torch.testing.assert_close(batch.target, returns((value + advantage).flatten()), rtol=1e-4, atol=1e-5)
     flat = advantage.flatten()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ import torch
 from learners import ROOT
 
 import diffsim
-from diffsim.tasks import TASKS
 from diffsim.tasks.base import ASSETS
 
 SNIPPETS = [
@@ -23,15 +21,11 @@ SNIPPETS = [
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """With a robot.xml of the reader's, and no new task afterwards."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a robot.xml of the reader's."""
     shutil.copy(ASSETS / "hopper.xml", tmp_path / "robot.xml")
     shutil.copy(ASSETS / "stage.xml", tmp_path)
     monkeypatch.chdir(tmp_path)
-    known = dict(TASKS)
-    yield
-    TASKS.clear()
-    TASKS.update(known)
 
 
 @pytest.mark.parametrize("code", SNIPPETS)

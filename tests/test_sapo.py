@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -47,33 +48,33 @@ def test_gradient_of_the_soft_loss_is_its_finite_difference() -> None:
     """Of two members of two critics each, through the simulator; one environment falls on the way."""
     torch.manual_seed(0)
     widths = "--actor-hidden", "16", "--critic-hidden", "16"
-    learner = build("ant", "--population", "2", "--initial-temperature", "3", *widths, dtype=torch.float64)
+    learner = build("ant", "--population", "2", *widths, dtype=torch.float64)
+    learner.temperature.log.data.fill_(math.log(3.0))
     env = learner.env
     qpos, qvel = env.qpos.clone(), env.qvel.clone()
     qpos[2, 2], qvel[2, 2] = 0.4, -6.0
     env.set_state(qpos, qvel)
     start, random = env.state_dict(), torch.get_rng_state()
-    losses: list[Tensor] = []
 
-    class Recorder:
-        lr = torch.zeros(())
+    class Taken(Exception):
+        """The loss."""
 
-        def step(self, loss: Tensor) -> Tensor:
-            losses.append(loss)
-            return loss.detach()
+    def take(loss: Tensor) -> Tensor:
+        raise Taken(loss)
 
-    learner.actor_optimizer = learner.temperature_optimizer = Recorder()  # type: ignore[assignment]
-    learner.actor.normalizer.update = lambda obs: None  # type: ignore[method-assign]
+    learner.actor_optimizer.gradient = take  # type: ignore[method-assign]
 
     def loss() -> Tensor:
         env.load_state_dict(start)
         torch.set_rng_state(random)
         torch.set_default_dtype(torch.float64)
         try:
-            learner.update_actor()
+            with pytest.raises(Taken) as taken:
+                learner.iterate()
         finally:
             torch.set_default_dtype(torch.float32)
-        return losses[-2]  # before the temperature's
+        (value,) = taken.value.args
+        return value
 
     places = (("body.layers.0.weight", 40), ("mean.layers.0.bias", 3), ("spread.layers.0.weight", 7))
     parameters = {name: p for name, p in learner.actor.named_parameters() if p.requires_grad}
@@ -101,8 +102,7 @@ def test_without_its_additions_it_is_shac() -> None:
         learner.actor_optimizer.lr.fill_(1e-3)
         learner.critic_optimizer.lr.fill_(1e-3)
         for _ in range(2):
-            learner.update_actor()
-            learner.update_critic()
+            learner.iterate()
     for ours, layers in ((plain.critics[0], reference.critic), (plain.policy, reference.policy)):
         for p, q in zip(ours.parameters(), layers.parameters(), strict=True):
             torch.testing.assert_close(p, q, rtol=1e-4, atol=1e-5)
@@ -110,13 +110,14 @@ def test_without_its_additions_it_is_shac() -> None:
 
 
 def test_targets_take_the_least_critic_and_the_actor_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = build("cartpole", "--no-entropy", "--gamma", "0.5", "--td-lambda", "1")
+    monkeypatch.setattr(sapo, "LAMBDA", 1.0)
+    learner = build("cartpole", "--no-entropy", "--gamma", "0.5")
     with torch.no_grad():
         for p in learner.targets.parameters():
             p.zero_()
         bias = list(learner.targets.parameters())[-1]
         bias.copy_(torch.tensor([[[10.0]], [[30.0]]]))
-    loss, values = sapo.actor_loss, list[Tensor]()
+    loss, values, fitted = sapo.actor_loss, list[Tensor](), list[Tensor]()
 
     def recorded(reward: Tensor, next_value: Tensor, *rest: object) -> Tensor:
         values.append(next_value)
@@ -128,34 +129,35 @@ def test_targets_take_the_least_critic_and_the_actor_the_mean(monkeypatch: pytes
     td_lambda = sapo.td_lambda
     monkeypatch.setattr(sapo, "actor_loss", recorded)
     monkeypatch.setattr(sapo, "td_lambda", without_reward)
-    learner.update_actor()
+    monkeypatch.setattr(learner, "fit_critics", lambda obs, value: fitted.append(value) or value.mean())
+    learner.iterate()
     assert (values[0] == 20).all()
-    torch.testing.assert_close(learner.value.view(8, 4)[0], torch.full((4,), 10 * 0.5**8))
+    torch.testing.assert_close(fitted[0].view(8, 4)[0], torch.full((4,), 10 * 0.5**8))
 
 
 def test_the_temperature_rises_below_the_target_entropy_and_falls_above_it() -> None:
     torch.manual_seed(0)
     for target, sign in ((5.0, 1), (-5.0, -1)):
-        learner = build("cartpole", "--initial-target-entropy", str(target), "--target-entropy", str(target))
+        learner = build("cartpole", "--target-entropy", str(target), str(target))
         learner.prepare(1)
-        learner.update_actor()
+        learner.iterate()
         assert sign * learner.temperature.log.item() == pytest.approx(5e-3, rel=1e-3)
 
 
 def test_the_target_entropy_is_linear() -> None:
-    learner = build("ant", "--iterations", "10", "--initial-target-entropy", "0", "--target-entropy", "-3")
+    learner = build("ant", "--iterations", "10", "--target-entropy", "0", "-3")
     for iteration in (1, 4, 10):
         learner.prepare(iteration)
         assert learner.target_entropy.item() == pytest.approx(-0.3 * (iteration - 1))
 
 
-def test_the_best_member_goes_on_with_the_samples_of_all() -> None:
+def test_the_best_member_goes_on_with_the_samples_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    learner = build("cartpole", "--population", "4", "--iterations", "10", "--selection", "0.3")
+    monkeypatch.setattr(sapo, "SELECTION", 0.3)
+    learner = build("cartpole", "--population", "4", "--iterations", "10")
     for iteration in range(1, 6):
         learner.prepare(iteration)
-        learner.update_actor()
-        learner.update_critic()
+        learner.iterate()
         if iteration == 3:
             best = learner.best
             before = [p.clone() for p in learner.policy.parameters()]
@@ -192,9 +194,8 @@ def test_members_of_equal_weights_and_samples_learn_as_one() -> None:
         learner.prepare(1)
         patch = pytest.MonkeyPatch()
         patch.setattr(torch, "randn", lambda *size, repeat=repeat, **_: noise.repeat(1, repeat, 1))
-        learner.update_actor()
+        learner.iterate()
         patch.undo()
-        learner.update_critic()
     for k in range(2):
         for p, q in zip(two.actor.deterministic(k).parameters(), one.policy.parameters(), strict=True):
             torch.testing.assert_close(p, q, rtol=1e-4, atol=1e-5)
@@ -205,7 +206,7 @@ def test_members_of_equal_weights_and_samples_learn_as_one() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [" ".join(PLAIN), "--critics 3 --population 3 --selection 0", "--num-envs 1 --horizon 1 --critic-minibatches 1"],
+    [" ".join(PLAIN), "--critics 3 --population 3", "--num-envs 1 --horizon 4"],
 )
 def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
     words = SMALL["shac"] + ["--iterations", "3", *arguments.split()]

@@ -24,21 +24,20 @@ PPO_LOSSES = " ".join(  # by CleanRL's names
     f"losses/{name}" for name in "policy_loss value_loss entropy approx_kl clipfrac explained_variance".split()
 )
 SCALARS = {
-    "shac": "losses/actor losses/critic charts/actor_lr charts/critic_lr time/update_actor time/update_critic",
+    "shac": "losses/actor losses/critic charts/actor_lr charts/critic_lr",
     "sapo": (
-        "losses/actor losses/critic charts/actor_lr charts/critic_lr charts/reward charts/entropy charts/temperature "
-        "time/update_actor time/update_critic"
+        "losses/actor losses/critic charts/actor_lr charts/critic_lr charts/reward charts/entropy charts/temperature"
     ),
-    "bptt": "losses/actor charts/learning_rate time/update",
-    "ppo_baseline": f"{PPO_LOSSES} charts/learning_rate charts/std time/collect time/update",
+    "bptt": "losses/actor charts/learning_rate",
+    "ppo_baseline": f"{PPO_LOSSES} charts/learning_rate charts/std",
     "pfpn": (
-        f"{PPO_LOSSES} charts/learning_rate time/interact time/learn "
+        f"{PPO_LOSSES} charts/learning_rate "
         "particles/dead_mean particles/dead_max particles/moved particles/active particles/std"
     ),
 }
 COMMON_SCALARS = (
     "charts/episodic_return charts/episodic_length charts/SPS eval/return eval/length grad/norm grad/skipped "
-    "sim/nonfinite sim/nonfinite_gradients time/evaluation time/total"
+    "sim/nonfinite sim/nonfinite_gradients time/evaluation time/iterate time/total"
 )
 
 
@@ -68,15 +67,15 @@ def checkpoint(trained):
 
 
 def test_another_seed_has_other_weights(script, small, checkpoint, tmp_path):
-    other = run(script, tmp_path, *small, "--seed", 2, "--stop-after", 1)
+    other = run(script, tmp_path, *small, "--seed", 2, stop_after=1)
     for name, weight in other["policy"]["weights"].items():
         if name.endswith("weight") and weight.ndim == 2:
             assert not torch.equal(weight, checkpoint["policy"]["weights"][name])
 
 
 def test_saving_and_evaluating_change_no_numbers(script, small, tmp_path):
-    often = run(script, tmp_path / "often", *small, "--stop-after", 3, "--save-every", 1, "--eval-every", 1)
-    never = run(script, tmp_path / "never", *small, "--stop-after", 3, "--save-every", 0, "--eval-every", 0)
+    often = run(script, tmp_path / "often", *small, "--save-every", 1, "--eval-every", 1, stop_after=3)
+    never = run(script, tmp_path / "never", *small, "--save-every", 0, "--eval-every", 0, stop_after=3)
     for name in ("modules", "ranks", "control_steps"):
         assert_same(often[name], never[name])
 
@@ -125,10 +124,10 @@ def test_files_of_a_run(script, trained, checkpoint):
     assert [bool(row["eval_return"]) for row in rows] == [k in (4, 8, 10) for k in range(1, 11)]
     assert [row["length"] for row in rows] == [""] * 7 + ["240.0"] * 3
     assert all(float(row["grad_skipped"]) == float(row["sim_nonfinite"]) == 0 for row in rows)
-    if "final_lr" in arguments:  # from the first rate to the last one, linearly
+    if final := getattr(script, "FINAL_LR", None):  # from the first rate to the last one, linearly
         for name in {"charts_actor_lr", "charts_critic_lr", "charts_learning_rate"} & rows[0].keys():
             first = arguments[{"charts_learning_rate": "lr"}.get(name, name.removeprefix("charts_"))]
-            rates = [first + (arguments["final_lr"] - first) * k / 10 for k in range(10)]
+            rates = [first + (final - first) * k / 10 for k in range(10)]
             assert [float(row[name]) for row in rows] == pytest.approx(rates, rel=1e-5)
     assert [bool(row["time_evaluation"]) for row in rows] == [bool(row["eval_return"]) for row in rows]
     late = {name for name in rows[0] if name.startswith("eval")} | {"return", "length", "time_evaluation"}
@@ -180,20 +179,20 @@ def test_nothing_captured_waits_for_the_device(script, small, tmp_path, monkeypa
         return call
 
     monkeypatch.setattr(graph, "capture", capture)
-    run(script, tmp_path, *small, "--stop-after", 3)
-    names = {"bptt": ["update"], "ppo_baseline": ["collect", "update"], "pfpn": ["interact", "learn"]}
-    assert captured == names.get(script.__name__, ["update_actor", "update_critic"])
+    run(script, tmp_path, *small, stop_after=3)
+    assert captured == ["iterate"]
     only_on_the_cpu = 'if self.device.type == "cpu" and bool(torch.isnan(action).any()):'
     assert set(places) == {f"env.py: {only_on_the_cpu}"}  # seen, so the rest would be seen
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("eager", [[], ["--no-cuda-graph"]])
-def test_same_seed_same_weights_on_a_gpu(script, tmp_path, eager):
+@pytest.mark.parametrize("graphs", [True, False])
+def test_same_seed_same_weights_on_a_gpu(script, tmp_path, monkeypatch, graphs):
+    monkeypatch.setattr(Run, "graphs", graphs)
     checkpoints = []
     for name in ("a", "b"):
         arguments = "--env cartpole --num-envs 8 --iterations 12 --eval-every 5 --eval-episodes 2 --quiet".split()
-        script.main([*arguments, "--device", "cuda", "--run-dir", str(tmp_path / name), *eager])
+        script.main([*arguments, "--device", "cuda", "--run-dir", str(tmp_path / name)])
         checkpoints.append(torch.load(tmp_path / name / "checkpoint.pt", weights_only=True, map_location="cpu"))
     assert_same(checkpoints[0]["modules"], checkpoints[1]["modules"])
 

@@ -69,8 +69,8 @@ def test_a_training_starts_without_pytorchs_compiler(tmp_path: Path) -> None:
     """It takes 1.2 s to import, and torch.optim would. Nor are the environments of evaluations made before they run."""
     program = """
 import sys, shac
-arguments = "--env cartpole --num-envs 2 --horizon 4 --iterations 2 --stop-after 1 --eval-episodes 2 --quiet"
-shac.Run.eval_env = None
+arguments = "--env cartpole --num-envs 2 --horizon 4 --iterations 2 --eval-episodes 2 --quiet"
+shac.Run.eval_env, shac.Run.stop_after = None, 1
 shac.main([*arguments.split(), "--device", "cpu", "--run-dir", "run"])
 print([name for name in ("torch._dynamo", "sympy") if name in sys.modules])
 """

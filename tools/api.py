@@ -17,7 +17,7 @@ and `TaskError` are `ValueError`s.
 """
 NAMES = "make DiffEnv Simulator Integration Task load_scene".split()
 # Methods that few programs need
-INTERNAL = """pin carry_over take_statistics advance check_tensor tangent check load_robot scene bind presets
+INTERNAL = """pin_window write_back take_statistics advance check_tensor tangent check load_robot scene bind presets
 integration falls has_mirror configured terrain stored restored over ghost disturb observe_with""".split()
 
 

@@ -1,6 +1,6 @@
-"""Where the GPU's time of one SHAC iteration goes: the kernels of its two CUDA graphs, by torch.profiler.
+"""Where the GPU's time of one SHAC iteration goes: the kernels of its CUDA graph, by torch.profiler.
 
-python tools/kernels.py hopper                     the iteration's two tables
+python tools/kernels.py hopper                     the iteration's table
 python tools/kernels.py ant --num-envs 1024        what follows the task goes to shac.py
 """
 
@@ -23,11 +23,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import shac  # noqa: E402
 
 ITERATION, LAST, ROWS = 12, 14, 30  # the one that is profiled, how many there are, kernels per table
-Half = Callable[[], dict[str, torch.Tensor]]
+Iterate = Callable[[], dict[str, torch.Tensor]]
 capture = graph.capture
 
 
-def profiled(function: Half, device: torch.device, env: diffsim.DiffEnv | None) -> Half:
+def profiled(function: Iterate, device: torch.device, env: diffsim.DiffEnv | None) -> Iterate:
     """graph.capture, whose twelfth call prints a table of its kernels."""
     replay, calls = capture(function, device, env), itertools.count(1)
 
@@ -52,5 +52,6 @@ def profiled(function: Half, device: torch.device, env: diffsim.DiffEnv | None) 
 
 if __name__ == "__main__":
     graph.capture = profiled  # type: ignore[assignment]
-    stop = ["--stop-after", str(LAST), "--eval-every", "0", "--quiet", "--run-dir", mkdtemp()]
+    shac.Run.stop_after = LAST
+    stop = ["--eval-every", "0", "--quiet", "--run-dir", mkdtemp()]
     shac.main(["--env", *(sys.argv[1:] or ["hopper"]), "--device", "cuda", *stop])

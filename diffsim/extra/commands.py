@@ -26,7 +26,7 @@ from diffsim.extra.report import report as report_robot
 from diffsim.extra.tune import tune
 from diffsim.robot.constraint import check_soft, constrained
 from diffsim.sim.launcher import available_cores
-from diffsim.tasks import FILE, Contact, find_task
+from diffsim.tasks import Contact, base_name, find_task
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.checkpoint import POLICIES
 from diffsim.training.errors import in_one_line
@@ -112,8 +112,8 @@ def drive(
 
     task = find_task(robot)
     saved = load_policy(checkpoint or shipped(task.name))
-    own = robot if FILE.fullmatch(robot) else None
-    if own is None and (trained := saved.task()) != task.name:
+    own = None if robot == task.name else robot  # a file, or a task with options
+    if own is None and (trained := base_name(saved.task())) != task.name:
         fail(f"{checkpoint} is a checkpoint of {trained}, not of {robot}")
     torch.set_num_threads(1)
     with startup.quick_kernels():

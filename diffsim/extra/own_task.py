@@ -16,7 +16,7 @@ FILE = re.compile(r"(.+\.py)(?::(\w+))?")  # my_task.py or my_task.py:Class
 
 
 def task_of_file(name: str) -> type[Task]:
-    """The task my_task.py:Class, or the only one of my_task.py, by the file's name unless it has one of its own."""
+    """Load the task my_task.py:Class, or the only one of my_task.py, named after the file unless it has a name."""
     file, wanted = FILE.fullmatch(name).groups()  # type: ignore[union-attr]
     path = Path(file).resolve()
     if not path.is_file():
@@ -37,7 +37,7 @@ def task_of_file(name: str) -> type[Task]:
 
 @functools.cache
 def _module(path: Path, _changed: int) -> ModuleType:
-    """A file as a module, which finds other modules in its folder."""
+    """Import a file as a module, which can import other modules of its folder."""
     spec = importlib.util.spec_from_file_location(str(path), path)
     sys.modules[str(path)] = module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
     sys.path.insert(0, str(path.parent))

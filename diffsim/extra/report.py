@@ -1,4 +1,4 @@
-"""What the simulator makes of an MJCF file: used, approximated, told. `python -m diffsim check robot.xml`"""
+"""Report how the simulator reads an MJCF file: `python -m diffsim check robot.xml`"""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROUGH_SHAPES = {
 
 
 def report(scene: Scene) -> str:
-    """A page of text about a scene."""
+    """Return a page of text about a scene."""
     sections = [
         (f"{scene.name}: can be simulated", list(_parts(scene))),
         ("approximated", [f"- {sentence}" for sentence in approximations(scene)]),
@@ -46,7 +46,7 @@ def _parts(scene: Scene) -> Iterator[str]:
 
 
 def approximations(scene: Scene) -> tuple[str, ...]:
-    """What is simulated only roughly, a sentence for each."""
+    """Return a sentence for each approximation."""
     return tuple(sentence for check in (_self_contact, _ground, _actuators) for sentence in check(scene))
 
 

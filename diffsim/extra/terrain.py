@@ -23,19 +23,19 @@ SEGMENT, LENGTH, LEVEL = 0.4, 30.0, 0.5  # m, of uneven ground: its segments, it
 
 
 def incline(degrees: float, start: float = 1.0) -> Array:
-    """(3, 2) a slope without end between -90 and 90 degrees, upward if positive."""
+    """Make an endless slope (3, 2) of -90 to 90 degrees, upward if positive."""
     return np.array([[start - 1.0, 0.0], [start, 0.0], [start + 1.0, _slope(degrees)]])
 
 
 def step(height: float, start: float = 1.0) -> Array:
-    """(4, 2) a wall of this height [m], not 0, at x = start, upward if positive; level before and after."""
+    """Make a wall (4, 2) of this height [m], not 0, at x = start, upward if positive; level before and after."""
     if not 0 < abs(height) < math.inf:
         raise ValueError(f"height is {height!r}, must be finite and not 0")
     return np.array([[start - 1.0, 0.0], [start, 0.0], [start, height], [start + 1.0, height]], np.float64)
 
 
 def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float = 50.0, start: float = 1.0) -> Array:
-    """(K, 2) segments of random slope, then level; K = 3 + length / segment, rounded.
+    """Make segments (K, 2) of random slope, then level ground; K = 3 + length / segment, rounded.
 
     Args:
         seed: of the slopes, an integer of at least 0; each has another profile.
@@ -56,7 +56,7 @@ def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float 
 
 
 def uneven(degrees: float, count: int, seed: int = 0) -> Array:
-    """(count, K, 2) profiles of ground that is rough before and behind the robot; a seed has the same ones always.
+    """Make profiles (count, K, 2) of ground that is rough before and behind the robot, the same ones for a seed.
 
     Within 0.5 m of x = 0 they are level. Then come segments of 0.4 m as of `rough`, for 30 m to both sides: robots that
     follow commands stay there in an episode, those that run do not. The steepest slope grows evenly from profile to

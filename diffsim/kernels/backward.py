@@ -22,10 +22,10 @@ import warp as wp
 
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.factors import D_LIMIT, K_LIMIT, MOTOR, lane_of
 from diffsim.kernels.force import external_force
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.lane import D_LIMIT, K_LIMIT, MOTOR, lane_of
 from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
@@ -54,22 +54,22 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     read, write, pick = block.read, block.write, block.pick
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in spec.features
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
-    # Local arrays have at least one element, also where nobody reads them.
-    NFACTORS, PULLS, BODIES = (len(FACTORS) if VARIED else 1), (NU if MUSCLE else 1), max(spec.forced, 1)
+    # Local arrays have at least one element, also where they are not read.
+    NFACTORS, TENSIONS, BODIES = (len(FACTORS) if VARIED else 1), (NU if MUSCLE else 1), max(spec.forced, 1)
 
     @wp.func
-    def rates(a: t.array3, here: Lane, k: int):
-        """Three rates of a checkpoint's row."""
+    def load_vec3(a: t.array3, here: Lane, k: int):
+        """Load three velocities or accelerations from a checkpoint's row."""
         return vec3(load(a, here.row, k, here.e), load(a, here.row, k + 1, here.e), load(a, here.row, k + 2, here.e))
 
     @wp.func
-    def next_rates(ck: Ck, here: Lane, k: int):
-        """Three rates at the end of the substep."""
-        return rates(ck.v, here, k) + here.h * rates(ck.a, here, k)
+    def end_velocity(ck: Ck, here: Lane, k: int):
+        """Compute three velocities at the end of the substep."""
+        return load_vec3(ck.v, here, k) + here.h * load_vec3(ck.a, here, k)
 
     @wp.func
-    def end_of(m: Model, here: Lane, ck: Ck, g: t.Batch, nodes: Nodes):
-        """Into nodes the gradient of the state after the substep here.row; returns the base's."""
+    def read_end_gradient(m: Model, here: Lane, ck: Ck, g: t.Batch, nodes: Nodes):
+        """Read the gradient of the state after the substep here.row into nodes; returns the base's."""
         e = here.e
         for i in range(1, here.n):
             nodes[i].gq = read(g.qpos_out, e, qpos_adr(m, here.at + i))
@@ -78,14 +78,14 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             for b in range(m.ball_count[here.lane]):
                 i = m.ball_slot[here.lane * NBALL + b]
                 adr = qpos_adr(m, here.at + i)
-                wb = next_rates(ck, here, VADR + link_of(m, here.at + i))
+                wb = end_velocity(ck, here, VADR + link_of(m, here.at + i))
                 rot_b = wp.normalize(kin.load_quat_row(ck.q, here.row, adr, e) * sp.exp_quat(here.h * wb))
                 gb = sp.to_tangent(rot_b, kin.load_quat(g.qpos_out, e, adr))
                 for k in range(3):
                     nodes[i + k].gq = gb[k]
         base = Base()
         if wp.static(FLOATING):
-            w = next_rates(ck, here, 3)
+            w = end_velocity(ck, here, 3)
             rot = wp.normalize(kin.load_quat_row(ck.q, here.row, 3, e) * sp.exp_quat(here.h * w))
             base.gp = vec3(read(g.qpos_out, e, 0), read(g.qpos_out, e, 1), read(g.qpos_out, e, 2))
             base.gr = sp.to_tangent(rot, kin.load_quat(g.qpos_out, e, 3))
@@ -94,28 +94,28 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         return base
 
     @wp.func
-    def balls_state(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes):
-        """Into links the turns of the ball joints, into nodes the adjoint of their integrator."""
-        turn = wp.zeros(shape=wp.static(max(NBALL, 1)), dtype=quat)
+    def recompute_balls(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes):
+        """Recompute the ball joints' rotations into links, and apply their integrator's adjoint to nodes."""
+        ball_rot = wp.zeros(shape=wp.static(max(NBALL, 1)), dtype=quat)
         for b in range(m.ball_count[here.lane]):
             i = m.ball_slot[here.lane * NBALL + b]
-            turn[b] = kin.load_quat_row(ck.q, here.row, qpos_adr(m, here.at + i), here.e)
+            ball_rot[b] = kin.load_quat_row(ck.q, here.row, qpos_adr(m, here.at + i), here.e)
             gb = vec3(nodes[i].gq, nodes[i + 1].gq, nodes[i + 2].gq)
-            rate = next_rates(ck, here, VADR + link_of(m, here.at + i))
-            gb_turn, gb_start = sp.exp_adjoint(here.h * rate, gb)
+            velocity = end_velocity(ck, here, VADR + link_of(m, here.at + i))
+            gb_turn, gb_start = sp.exp_adjoint(here.h * velocity, gb)
             for k in range(3):
                 nodes[i + k].gqd = nodes[i + k].gqd + here.h * (gb_turn[k] - gb[k])
                 nodes[i + k].gq = gb_start[k]
-        kin.place_balls(m, here, turn, links)
+        kin.place_balls(m, here, ball_rot, links)
 
     @wp.func
-    def base_state(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
-        """The floating base's motion into links[0] and nodes[0]; returns it with the adjoint of its integrator."""
+    def recompute_base(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
+        """Recompute the floating base's motion into links[0] and nodes[0]; returns its integrator's adjoint."""
         rot = kin.load_quat_row(ck.q, here.row, 3, here.e)
-        v = rates(ck.v, here, 0)
-        w = rates(ck.v, here, 3)
-        vdot = rates(ck.a, here, 0) - vec3(m.gravity)
-        wdot = rates(ck.a, here, 3)
+        v = load_vec3(ck.v, here, 0)
+        w = load_vec3(ck.v, here, 3)
+        vdot = load_vec3(ck.a, here, 0) - vec3(m.gravity)
+        wdot = load_vec3(ck.a, here, 3)
         g_turn, gr_start = sp.exp_adjoint(here.h * (w + here.h * wdot), base.gr)
         base.gv = base.gv + here.h * base.gp
         base.gw = base.gw + here.h * g_turn
@@ -126,8 +126,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(DAMPED):
             nodes[0].D = join(R * wdot, vdot)
         if wp.static(CONSTRAINED):
-            vdot = rates(ck.a, here, NV) - vec3(m.gravity)
-            wdot = rates(ck.a, here, NV + 3)
+            vdot = load_vec3(ck.a, here, NV) - vec3(m.gravity)
+            wdot = load_vec3(ck.a, here, NV + 3)
         if wp.static(DAMPED):
             nodes[0].D = nodes[0].D - join(R * wdot, vdot)
         nodes[0].A = join(R * wdot, vdot - wp.cross(R * w, v))
@@ -138,12 +138,12 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         return base
 
     @wp.func
-    def joints_state(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes):
-        """How the links move, into nodes."""
+    def recompute_joints(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes):
+        """Recompute the links' accelerations into nodes."""
         for i in range(1, here.n):
             k = here.at + i
             p = m.parent[k]
-            own = links[i]  # X
+            own = links[i]
             turning = i
             if wp.static(NBALL > 0):
                 turning = m.inboard[k]
@@ -151,56 +151,66 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             qdd = load(ck.a, here.row, int(CONSTRAINED) * NV + adr, here.e)
             nodes[i].A = nodes[p].A + own.S * qdd + wp.spatial_cross(links[turning].V, own.S * own.qd)
             if wp.static(CONSTRAINED):
-                nodes[i].rate = qdd
+                nodes[i].qacc = qdd
                 nodes[i].B = nodes[p].B + own.S * qdd
             if wp.static(DAMPED):
                 nodes[i].D = nodes[p].D + own.S * (load(ck.a, here.row, adr, here.e) - qdd)
             if wp.static(CLAMP):
-                nodes[i].free = joint.actuation_free(m, k, nodes[i].motor, own.q, own.qd)
+                nodes[i].unclamped = joint.actuator_unclamped(m, k, nodes[i].motor, own.q, own.qd)
 
     @wp.func
     def partials(
-        m: Model, here: Lane, links: Links, nodes: Nodes, place: t.Place, ck: Ck, adj: Adjoints, adj_factors: Array
+        # model
+        m: Model,
+        here: Lane,
+        # state in
+        links: Links,
+        nodes: Nodes,
+        carrier: t.CarrierPos,
+        ck: Ck,
+        # out
+        adj: Adjoints,
+        adj_factors: Array,
     ):
-        """Into adj the partial derivatives of phi, link by link."""
+        """Compute the partial derivatives of phi of each link into adj."""
         for i in range(1, INERT + 1):
             adj[i] = Adjoint()
         for i in range(FIRST, here.n):
             k = here.at + i
-            own = link.link_adjoint(m, here, k, links[i], nodes[i], place, adj_factors)
+            own = link.link_adjoint(m, here, k, links[i], nodes[i], carrier, adj_factors)
             if wp.static(CONSTRAINED and CONTACT):
-                own = constraint.add_contacts_adjoint(m, here, k, links[i], nodes[i], place, ck, own, adj_factors)
+                own = constraint.add_contacts_adjoint(m, here, k, links[i], nodes[i], carrier, ck, own, adj_factors)
             if wp.static(DAMPED):
                 own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own, adj_factors)
             adj[i] = own
 
     @wp.func
-    def joint_gain(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
-        """Derivatives of the joint's force with respect to q and qd."""
+    def joint_derivatives(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
+        """Differentiate the joint's force with respect to q and qd."""
         k = here.at + i
-        end_rate = link.qd
+        end_qd = link.qd
         if wp.static(IMPLICIT and LIMIT):
-            end_rate = end_rate + here.h * load(ck.a, here.row, VADR + link_of(m, k), here.e)
-        within = T(1.0)
+            end_qd = end_qd + here.h * load(ck.a, here.row, VADR + link_of(m, k), here.e)
+        unclamped = T(1.0)
         if wp.static(CLAMP):
-            within = own.free
-        gain = joint.gain(m, here, k, link.q, link.qd, end_rate, within)
+            unclamped = own.unclamped
+        derivatives = joint.derivatives(m, here, k, link.q, link.qd, end_qd, unclamped)
         if wp.static(VARIED and LIMIT):
-            if m.carried[k] == 1:  # of the lanes that have the joint
-                by = joint.limit_constants_gain(m, here, k, link.q, link.qd, end_rate)
+            if m.owned[k] == 1:  # of the lanes that have the joint
+                by = joint.limit_constants_derivatives(m, here, k, link.q, link.qd, end_qd)
                 adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * by[0]
                 adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - own.lam * by[1]
         if wp.static(CONSTRAINED):
-            of_held = constraint.joint_gain(m, here, k, link.q, link.qd, own.rate)
-            gain = gain + vec2(of_held[0], of_held[1])
+            con_derivatives = constraint.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
+            derivatives = derivatives + vec2(con_derivatives[0], con_derivatives[1])
             if wp.static(VARIED):
-                if m.carried[k] == 1:
-                    adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * of_held[2]
-        return gain
+                if m.owned[k] == 1:
+                    adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * con_derivatives[2]
+        return derivatives
 
     @wp.func
     def inward(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints, adj_factors: Array):
-        """Sums adj over subtrees and projects it on the joints."""
+        """Sum adj over subtrees and project it on the joints."""
         slots = int(SLOTS)
         if wp.static(SHARERS > 1):
             sums.sharers.add_adjoints(adj)
@@ -217,50 +227,49 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     p = m.inboard[k]
                     turned = m.outboard[k]
                 own = nodes[i]
-                gain = joint_gain(m, here, i, ck, links[i], own, adj_factors)
+                derivatives = joint_derivatives(m, here, i, ck, links[i], own, adj_factors)
                 S = links[i].S
-                by = adj[i]
-                xv = by.v - wp.spatial_cross_dual(links[p].V, by.a)
+                total = adj[i]
+                xv = total.v - wp.spatial_cross_dual(links[p].V, total.a)
                 gq = (
                     own.gq
-                    + wp.dot(by.p, S)
+                    + wp.dot(total.p, S)
                     - wp.dot(xv, wp.spatial_cross(S, links[p].V))
-                    - wp.dot(by.w, wp.spatial_cross(S, nodes[p].W))
-                    - wp.dot(by.a, wp.spatial_cross(S, nodes[p].A))
-                    - own.lam * gain[0]
+                    - wp.dot(total.w, wp.spatial_cross(S, nodes[p].W))
+                    - wp.dot(total.a, wp.spatial_cross(S, nodes[p].A))
+                    - own.lam * derivatives[0]
                 )
                 if wp.static(CONSTRAINED):
-                    gq = gq - wp.dot(by.b, wp.spatial_cross(S, nodes[p].B))
+                    gq = gq - wp.dot(total.b, wp.spatial_cross(S, nodes[p].B))
                 if wp.static(DAMPED):
-                    gq = gq - wp.dot(by.d, wp.spatial_cross(S, nodes[p].D))
-                    gq = gq - wp.dot(by.w1, wp.spatial_cross(S, nodes[p].W1))
+                    gq = gq - wp.dot(total.d, wp.spatial_cross(S, nodes[p].D))
+                    gq = gq - wp.dot(total.w1, wp.spatial_cross(S, nodes[p].W1))
                 nodes[i].gq = gq
-                nodes[i].gqd = (
-                    own.gqd + wp.dot(xv - wp.spatial_cross_dual(links[turned].V, by.a), S) - own.lam * gain[1]
-                )
-                within = T(1.0)
+                xa = xv - wp.spatial_cross_dual(links[turned].V, total.a)
+                nodes[i].gqd = own.gqd + wp.dot(xa, S) - own.lam * derivatives[1]
+                unclamped = T(1.0)
                 if wp.static(CLAMP):
-                    within = own.free
-                nodes[i].gtau = own.gtau - within * own.lam
+                    unclamped = own.unclamped
+                nodes[i].gtau = own.gtau - unclamped * own.lam
                 if wp.static(NBALL > 0):
                     p = m.parent[k]
                 if wp.static(FLOATING) or p > 0:
-                    adj[p] = link.plus(adj[p], by)
+                    adj[p] = link.add_adjoints(adj[p], total)
 
     @wp.func
     def ball_springs(m: Model, here: Lane, links: Links, nodes: Nodes):
-        """The spring sees the rotation vector, whose derivative in the tangent space is not the identity."""
+        """Correct the springs' gradient: a rotation vector's derivative in the tangent space is not the identity."""
         for b in range(m.ball_count[here.lane]):
             i = m.ball_slot[here.lane * NBALL + b]
             lb = vec3(nodes[i].lam, nodes[i + 1].lam, nodes[i + 2].lam)
-            turn = vec3(links[i].q, links[i + 1].q, links[i + 2].q)
-            lb = T(m.stiffness[here.at + i]) * (sp.log_adjoint(turn, lb) - lb)
+            rotation = vec3(links[i].q, links[i + 1].q, links[i + 2].q)
+            lb = T(m.stiffness[here.at + i]) * (sp.log_adjoint(rotation, lb) - lb)
             for k in range(3):
                 nodes[i + k].gq = nodes[i + k].gq + lb[k]
 
     @wp.func
     def base_inward(m: Model, link: Link, own: Node, adj: Adjoint, base: Base):
-        """The floating base is a translation, whose "parent" twists are pure linear ones, then a ball joint."""
+        """Project adj on the base: a translation, whose "parent" twists are purely linear, then a ball joint."""
         vp = join(vec3(), base.v)
         wl = join(vec3(), wp.spatial_bottom(own.W))
         ap = join(vec3(), base.vdot)
@@ -283,99 +292,112 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         return base
 
     @wp.func
-    def broken_numbers(
-        m: Model, here: Lane, base: Base, nodes: Nodes, adj_pull: Array, adj_factors: Array, adj_forces: t.vec6s
+    def count_nonfinite(
+        m: Model, here: Lane, base: Base, nodes: Nodes, adj_tension: Array, adj_factors: Array, adj_forces: t.vec6s
     ):
-        """How many numbers of the gradient are not finite."""
-        broken = T(0.0)
+        """Count numbers of the gradient that are not finite."""
+        failed = T(0.0)
         for i in range(1, here.n):
-            broken = broken + block.broken(nodes[i].gq) + block.broken(nodes[i].gqd) + block.broken(nodes[i].gtau)
+            failed = failed + block.is_nonfinite(nodes[i].gq) + block.is_nonfinite(nodes[i].gqd)
+            failed = failed + block.is_nonfinite(nodes[i].gtau)
         if wp.static(FLOATING):
             for k in range(3):
-                broken = broken + block.broken(base.gp[k]) + block.broken(base.gr[k])
-                broken = broken + block.broken(base.gv[k]) + block.broken(base.gw[k])
+                failed = failed + block.is_nonfinite(base.gp[k]) + block.is_nonfinite(base.gr[k])
+                failed = failed + block.is_nonfinite(base.gv[k]) + block.is_nonfinite(base.gw[k])
         if wp.static(MUSCLE):
             for entry in range(m.muscle_begin[here.lane], m.muscle_begin[here.lane + 1]):
-                broken = broken + block.broken(adj_pull[m.muscle[entry]])
+                failed = failed + block.is_nonfinite(adj_tension[m.muscle[entry]])
         if wp.static(VARIED):
             for k in range(NFACTORS):
-                broken = broken + block.broken(adj_factors[k])
+                failed = failed + block.is_nonfinite(adj_factors[k])
         if wp.static(FORCED):
-            broken = broken + force.broken_forces(m, here, adj_forces)
+            failed = failed + force.count_nonfinite_forces(m, here, adj_forces)
         if wp.static(THREADS_PER_ENV > 1):
-            broken = sums.add(broken)
-        return broken
+            failed = sums.add(failed)
+        return failed
 
     @wp.func
-    def hand_out(out: t.array2, e: int, column: int, drop: T, value: T):
-        """Writes the value, but 0 where the gradient is dropped."""
+    def write_gradient(out: t.array2, e: int, column: int, drop: T, value: T):
+        """Write the value, and 0 where the gradient is dropped."""
         write(out, e, column, pick(T(0.0), drop, T(0.0), value))
 
     @wp.func
     def write_controls(
-        m: Model, here: Lane, drop: T, ctrl: t.array2, nodes: Nodes, adj_pull: Array, adj_factors: Array, g: t.Batch
+        # model
+        m: Model,
+        here: Lane,
+        # controls and gradients in
+        drop: T,
+        ctrl: t.array2,
+        nodes: Nodes,
+        adj_tension: Array,
+        adj_factors: Array,
+        # out
+        g: t.Batch,
     ):
-        """Writes the gradients of actions and factors."""
+        """Write the gradients of controls and factors."""
         for k in range(NU):
             if m.motor_lane[k] == here.lane:
-                by = T(0.0)
+                g_force = T(0.0)
                 if wp.static(DRIVEN):
-                    by = nodes[m.motor_slot[here.lane * NU + k]].gtau
+                    g_force = nodes[m.motor_slot[here.lane * NU + k]].gtau
                 if wp.static(MUSCLE):
-                    by = by + adj_pull[k]
+                    g_force = g_force + adj_tension[k]
                 if wp.static(VARIED):
                     motor = T(m.gear[k]) * read(ctrl, here.e, k) + T(m.motor_bias[k])
-                    adj_factors[MOTOR] = adj_factors[MOTOR] + by * motor
-                    by = here.motor * by
-                hand_out(g.ctrl, here.e, k, drop, by * T(m.gear[k]))
+                    adj_factors[MOTOR] = adj_factors[MOTOR] + g_force * motor
+                    g_force = here.motor * g_force
+                write_gradient(g.ctrl, here.e, k, drop, g_force * T(m.gear[k]))
         if wp.static(VARIED):
             for k in range(NFACTORS):
                 total = adj_factors[k]
                 if wp.static(THREADS_PER_ENV > 1):
                     total = sums.add(total)
                 if here.lane == 0:
-                    hand_out(g.factors, here.e, k, drop, total)
+                    write_gradient(g.factors, here.e, k, drop, total)
 
     @wp.func
     def write_state(m: Model, here: Lane, drop: T, qpos: t.array2, base: Base, nodes: Nodes, g: t.Batch):
-        """Writes the gradients of qpos and qvel."""
+        """Write the gradients of qpos and qvel."""
         e = here.e
         for i in range(1, here.n):
-            hand_out(g.qpos, e, qpos_adr(m, here.at + i), drop, nodes[i].gq)
-            hand_out(g.qvel, e, VADR + link_of(m, here.at + i), drop, nodes[i].gqd)
+            write_gradient(g.qpos, e, qpos_adr(m, here.at + i), drop, nodes[i].gq)
+            write_gradient(g.qvel, e, VADR + link_of(m, here.at + i), drop, nodes[i].gqd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 i = m.ball_slot[here.lane * NBALL + b]
                 adr = qpos_adr(m, here.at + i)
                 gb = vec3(nodes[i].gq, nodes[i + 1].gq, nodes[i + 2].gq)
                 gb4 = sp.from_tangent(kin.load_quat(qpos, e, adr), gb)
-                hand_out(g.qpos, e, adr, drop, gb4[3])
+                write_gradient(g.qpos, e, adr, drop, gb4[3])
                 for k in range(3):
-                    hand_out(g.qpos, e, adr + 1 + k, drop, gb4[k])
+                    write_gradient(g.qpos, e, adr + 1 + k, drop, gb4[k])
         if wp.static(FLOATING):
             g4 = sp.from_tangent(kin.load_quat(qpos, e, 3), base.gr)
             for k in range(3):
-                hand_out(g.qpos, e, k, drop, base.gp[k])
-                hand_out(g.qpos, e, 4 + k, drop, g4[k])
-                hand_out(g.qvel, e, k, drop, base.gv[k])
-                hand_out(g.qvel, e, 3 + k, drop, base.gw[k])
-            hand_out(g.qpos, e, 3, drop, g4[3])
+                write_gradient(g.qpos, e, k, drop, base.gp[k])
+                write_gradient(g.qpos, e, 4 + k, drop, g4[k])
+                write_gradient(g.qvel, e, k, drop, base.gv[k])
+                write_gradient(g.qvel, e, 3 + k, drop, base.gw[k])
+            write_gradient(g.qpos, e, 3, drop, g4[3])
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def backward(
         # model
         m: Model,
         first: int,  # block of this launch
-        seconds: t.U,  # of a substep
+        # options
+        seconds: t.U,  # length of a substep
         substeps: int,
         # checkpoint in
         row0: int,
         ck: t.Checkpoint,
-        # what came in (its quaternions may not be of unit length), and whether the step was contained
-        batch: t.Batch,
-        nonfinite: wp.array(dtype=wp.bool),
-        # gradient, of what came out in, of what came in out
+        # state in
+        batch: t.Batch,  # whose quaternions may have any length
+        nonfinite: wp.array(dtype=wp.bool),  # environments that kept their state
+        # gradients, of the new state in, of all else out
         g: t.Batch,
+        # out
         nonfinite_gradients: wp.array(dtype=int),
     ):
         here = lane(m, first, wp.tid(), T(seconds), batch.factors)
@@ -384,51 +406,51 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)
         adj_factors = wp.zeros(shape=NFACTORS, dtype=T)
         adj_forces = wp.zeros(shape=BODIES, dtype=vec6)
-        pull = wp.zeros(shape=PULLS, dtype=T)
-        adj_pull = wp.zeros(shape=PULLS, dtype=T)
+        tension = wp.zeros(shape=TENSIONS, dtype=T)
+        adj_tension = wp.zeros(shape=TENSIONS, dtype=T)
         if wp.static(CLAMP):
-            joint.drive_again(m, here, batch.ctrl, nodes)
+            joint.motors_backward(m, here, batch.ctrl, nodes)
         if wp.static(MUSCLE):
-            muscle.activate(m, here, batch.ctrl, pull)
+            muscle.compute_tensions(m, here, batch.ctrl, tension)
         links[0].R = wp.identity(3, dtype=T)
         here.row = row0 + substeps - 1
-        base = end_of(m, here, ck, g, nodes)
+        base = read_end_gradient(m, here, ck, g, nodes)
         for sub in range(substeps):
             here.row = row0 + substeps - 1 - sub
             # 1. the state of this substep, and the adjoint of the integrator
-            place = kin.carrier_place(m, T(0.0), T(0.0))
+            carrier = kin.carrier_position(m, T(0.0), T(0.0))
             nodes[0].A = join(vec3(), -vec3(m.gravity))
             for i in range(1, here.n):
                 links[i].q = load(ck.q, here.row, qpos_adr(m, here.at + i), here.e)
                 links[i].qd = load(ck.v, here.row, VADR + link_of(m, here.at + i), here.e)
                 nodes[i].gqd = nodes[i].gqd + here.h * nodes[i].gq
             if wp.static(NBALL > 0):
-                balls_state(m, here, ck, links, nodes)
+                recompute_balls(m, here, ck, links, nodes)
             if wp.static(FLOATING):
-                base = base_state(m, here, ck, links, nodes, base)
-                place = kin.carrier_place(m, load(ck.q, here.row, 0, here.e), load(ck.q, here.row, 2, here.e))
-            place = kin.place_links(m, here, links, place)
-            joints_state(m, here, ck, links, nodes)
+                base = recompute_base(m, here, ck, links, nodes, base)
+                carrier = kin.carrier_position(m, load(ck.q, here.row, 0, here.e), load(ck.q, here.row, 2, here.e))
+            carrier = kin.place_links(m, here, links, carrier)
+            recompute_joints(m, here, ck, links, nodes)
             # 2. to 4.
             solve(m, here, ck, links, nodes, base)
-            partials(m, here, links, nodes, place, ck, adj, adj_factors)
+            partials(m, here, links, nodes, carrier, ck, adj, adj_factors)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):
-                muscle.add_muscles_adjoint(m, here, pull, links, nodes, adj, adj_pull)
+                muscle.add_muscles_adjoint(m, here, tension, links, nodes, adj, adj_tension)
             inward(m, here, ck, links, nodes, adj, adj_factors)
             if wp.static(BALL_SPRING):
                 ball_springs(m, here, links, nodes)
             if wp.static(FLOATING):
                 base = base_inward(m, links[0], nodes[0], adj[0], base)
 
-        # A gradient that left the finite numbers, or of a contained step, is zero.
-        broken = broken_numbers(m, here, base, nodes, adj_pull, adj_factors, adj_forces)
+        # A gradient that is not finite, or of an environment that kept its state, is zero.
+        failed = count_nonfinite(m, here, base, nodes, adj_tension, adj_factors, adj_forces)
         contained = block.read_flags(nonfinite, here.e)
         if here.lane == 0:
-            block.count(nonfinite_gradients, here.e, pick(T(0.0), contained, T(0.0), broken))
-        drop = broken + contained
-        write_controls(m, here, drop, batch.ctrl, nodes, adj_pull, adj_factors, g)
+            block.count(nonfinite_gradients, here.e, pick(T(0.0), contained, T(0.0), failed))
+        drop = failed + contained
+        write_controls(m, here, drop, batch.ctrl, nodes, adj_tension, adj_factors, g)
         if wp.static(FORCED):
             force.write_forces_adjoint(m, here, drop, adj_forces, g.forces)
         write_state(m, here, drop, batch.qpos, base, nodes, g)

@@ -4,11 +4,11 @@ A row of MuJoCo's constraints has a force that depends on the acceleration a of 
 
     jar = J a + b v + k d(r) r,   D = d(r) / ((1 - d(r)) w),
 
-with v the row's velocity, r < 0 how far it is beyond its margin, d(r) its impedance (`solimp`), k and b from `solref`,
-w its inverse weight. MuJoCo leaves dJ/dt v out of J a, so it is that of the twists B that links would have if the joint
-rates were their accelerations. A limit pushes with -D jar where jar < 0, dry friction with -D jar bounded by +-eta, a
-contact with the three numbers of `cone`. All are linear in a within their zones, with slope -H. So Newton's step of
-MuJoCo's convex problem,
+with v the row's velocity, r < 0 its violation of the margin, d(r) its impedance (`solimp`), k and b from `solref`, and
+w its inverse weight. J a - jar is MuJoCo's aref. MuJoCo leaves dJ/dt v out of J a. So J a is the velocity of the twists
+B that the links would have if the joints' velocities were their accelerations. A limit has the force -D jar where
+jar < 0, dry friction -D jar bounded by +-eta, a contact the three numbers of `cone_force`. All are linear in a within
+their zones, with slope -H. So a Newton step of MuJoCo's convex problem,
 
     (M + J'HJ) (a_new - a) = tau + J'f(a) - M a,
 
@@ -25,8 +25,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.factors import K_D, K_N, MU
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.lane import K_D, K_N, MU
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -38,15 +38,15 @@ from diffsim.kernels.wide import blocks
 def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
     T, U, vec2, vec3, vec4, vec6, mat3 = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3
-    Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
+    Params, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
     Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
-    Place, Frame, ground, TERRAIN = t.Place, t.Frame, terrain_contact(spec), "terrain" in spec.features
+    CarrierPos, Frame, ground, TERRAIN = t.CarrierPos, t.Frame, terrain_contact(spec), "terrain" in spec.features
     in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
     @wp.func
-    def row(c: Numbers, stiffness: T, r: T):
-        """(D, D' / D, k d r, (k d r)'), primes with respect to r <= 0; stiffness is a factor of k."""
+    def impedance_row(c: Params, stiffness: T, r: T):
+        """Return (D, D' / D, k d r, (k d r)'), primes with respect to r <= 0; stiffness is a factor of k."""
         x = wp.min(-r / T(c[7]), T(1.0))
         middle, power = T(c[8]), T(c[9])
         if c[9] == U(2.0):
@@ -67,23 +67,23 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(d / (rest * T(c[4])), slope / (d * rest), k * d * r, k * (d + slope * r))
 
     @wp.func
-    def cone(D: T, friction: T, squash: T, jar: vec3, stuck: T):
-        """Force of a contact, and the matrix H of minus its derivatives; squash is 1 / impratio.
+    def cone_force(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
+        """Return a contact's force, and H, minus its derivatives in jar.
 
-        Where stuck is 1 it is as if it stuck, however it does.
+        Where sticking is 1, the zone is MuJoCo's quadratic one, whatever jar is.
         """
         normal = jar[2]
         slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
-        sticks = wp.max(stuck, pick(slip, -friction * squash * normal, T(1.0), T(0.0)))
-        slides = wp.max(pick(normal, friction * slip, T(1.0), T(0.0)) - sticks, T(0.0))
-        Dn = sticks * D
-        Dt = Dn / squash
-        Ds = slides * D / (T(1.0) + friction * friction * squash)
+        quadratic = wp.max(sticking, pick(slip, -friction * inv_impratio * normal, T(1.0), T(0.0)))
+        conical = wp.max(pick(normal, friction * slip, T(1.0), T(0.0)) - quadratic, T(0.0))
+        Dn = quadratic * D
+        Dt = Dn / inv_impratio
+        Ds = conical * D / (T(1.0) + friction * friction * inv_impratio)
         over = normal - friction * slip
-        inverse = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
-        tx = inverse * jar[0]
-        ty = inverse * jar[1]
-        across = Dt - Ds * over * friction * inverse
+        inv_slip = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
+        tx = inv_slip * jar[0]
+        ty = inv_slip * jar[1]
+        across = Dt - Ds * over * friction * inv_slip
         along = Ds * friction * friction - (across - Dt)
         nx = -Ds * friction * tx
         ny = -Ds * friction * ty
@@ -93,89 +93,93 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return f, H
 
     @wp.func
-    def by_friction(D: T, friction: T, squash: T, jar: vec3, w: vec3):
-        """w . df / d friction; only what slides depends on it."""
+    def friction_derivative(D: T, friction: T, inv_impratio: T, jar: vec3, w: vec3):
+        """Return w . df / d friction, which is 0 outside the cone's zone."""
         slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
-        sticks = pick(slip, -friction * squash * jar[2], T(1.0), T(0.0))
-        slides = pick(jar[2], friction * slip, T(1.0), T(0.0)) - sticks
-        inverse = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
-        mu2 = T(1.0) + friction * friction * squash
-        Ds = slides * D / mu2
+        quadratic = pick(slip, -friction * inv_impratio * jar[2], T(1.0), T(0.0))
+        conical = pick(jar[2], friction * slip, T(1.0), T(0.0)) - quadratic
+        inv_slip = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
+        mu2 = T(1.0) + friction * friction * inv_impratio
+        Ds = conical * D / mu2
         over = jar[2] - friction * slip
-        change = Ds * (T(2.0) * friction * squash / mu2 * over + slip)  # of the normal force
-        along = inverse * (jar[0] * w[0] + jar[1] * w[1])
+        change = Ds * (T(2.0) * friction * inv_impratio / mu2 * over + slip)  # of the normal force
+        along = inv_slip * (jar[0] * w[0] + jar[1] * w[1])
         return change * w[2] + (Ds * over - friction * change) * along
 
     @wp.func
-    def place(m: Model, here: Lane, c: int, link: Link, carrier: Place):
-        """Centre of contact sphere c, its distance from the ground, 1 where that is within its margin, else 0; the
-        frame of the contact, and the ground's curvature in it."""
+    def locate_contact(m: Model, here: Lane, c: int, link: Link, carrier: CarrierPos):
+        """Locate contact sphere c over the ground.
+
+        Returns:
+            its centre, its distance from the ground, 1 within its margin, else 0; the contact's frame E, and the
+            ground's curvature in it.
+        """
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
-        reach = T(m.contact_radius[c] + m.contact_numbers[c][10])
+        reach = T(m.contact_radius[c] + m.contact_params[c][10])
         distance, E, curvature = ground.distance(m, here, c, centre, carrier, reach)
-        return centre, distance, pick(distance, T(m.contact_numbers[c][10]), T(1.0), T(0.0)), E, curvature
+        return centre, distance, pick(distance, T(m.contact_params[c][10]), T(1.0), T(0.0)), E, curvature
 
     @wp.func
-    def constants(m: Model, here: Lane, c: int):
-        """(stiffness, damping, friction) of contact sphere c."""
-        numbers = m.contact_numbers[c]
+    def contact_constants(m: Model, here: Lane, c: int):
+        """Return contact sphere c's factor of k, its b and its friction."""
+        params = m.contact_params[c]
         if wp.static(VARIED):
-            return vec3(here.k_n, wp.sqrt(here.k_n) * T(numbers[1]), here.mu * T(numbers[2]))
-        return vec3(T(1.0), T(numbers[1]), T(numbers[2]))
+            return vec3(here.k_n, wp.sqrt(here.k_n) * T(params[1]), here.mu * T(params[2]))
+        return vec3(T(1.0), T(params[1]), T(params[2]))
 
     @wp.func
-    def contact_state(m: Model, here: Lane, c: int, centre: vec3, distance: T, on: T, E: Frame, V: vec6, B: vec6):
-        """MuJoCo's contact point, jar, what row and what constants return; D is 0 where the sphere does not touch."""
-        numbers = m.contact_numbers[c]
-        # The point lies in the middle between the two surfaces.
+    def contact_state(m: Model, here: Lane, c: int, centre: vec3, distance: T, active: T, E: Frame, V: vec6, B: vec6):
+        """Return MuJoCo's contact point, jar, impedance_row, with D = 0 beyond the margin, and contact_constants."""
+        params = m.contact_params[c]
+        # The point lies midway between the two surfaces.
         p = centre - in_world(E, vec3(T(0.0), T(0.0), T(m.contact_radius[c]) + T(0.5) * distance))
-        of = constants(m, here, c)
-        state = row(numbers, of[0], wp.min(distance - T(numbers[10]), T(0.0)))
-        jar = in_frame(E, point_velocity(B, p) + of[1] * point_velocity(V, p)) + vec3(T(0.0), T(0.0), state[2])
-        D = on * state[0]
+        coef = contact_constants(m, here, c)
+        state = impedance_row(params, coef[0], wp.min(distance - T(params[10]), T(0.0)))
+        jar = in_frame(E, point_velocity(B, p) + coef[1] * point_velocity(V, p)) + vec3(T(0.0), T(0.0), state[2])
+        D = active * state[0]
         if wp.static(VARIED):
             D = here.k_d * D
-        return p, jar, vec4(D, state[1], state[2], state[3]), of
+        return p, jar, vec4(D, state[1], state[2], state[3]), coef
 
     @wp.func
-    def touch(m: Model, here: Lane, links: t.Links, carrier: Place, touches: t.Contacts):
-        """The contacts of a lane at the start of a substep, without acceleration.
+    def begin_contacts(m: Model, here: Lane, links: t.Links, carrier: CarrierPos, contacts: t.Contacts):
+        """Set up a lane's contacts at the start of a substep, with zero acceleration.
 
-        They are linear about where they were in the last substep, and stick if they did not touch there.
+        The force is linear about the last substep's jar; a new contact is in the quadratic zone.
         """
         first = m.contact_begin[here.at]
         for i in range(here.n):
             for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
                 s = c - first
-                centre, distance, on, E, _ = place(m, here, c, links[i], carrier)
-                stuck = T(1.0) - on * touches[s].on
-                touches[s].on = on
-                if block.any_of(on):
-                    p, jar, state, of = contact_state(m, here, c, centre, distance, on, E, links[i].V, vec6())
-                    was = vec3()
+                centre, distance, active, E, _ = locate_contact(m, here, c, links[i], carrier)
+                sticking = T(1.0) - active * contacts[s].active
+                contacts[s].active = active
+                if block.any_of(active):
+                    p, jar, state, coef = contact_state(m, here, c, centre, distance, active, E, links[i].V, vec6())
+                    last_jar = vec3()
                     for r in range(3):
-                        was[r] = pick(T(0.0), stuck, jar[r], touches[s].jar[r])
-                    f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), was, stuck)
-                    touches[s].p = p
-                    touches[s].jar = jar
-                    touches[s].D = state[0]
-                    touches[s].f = f + H * (was - jar)
-                    touches[s].H = H
+                        last_jar[r] = pick(T(0.0), sticking, jar[r], contacts[s].jar[r])
+                    f, H = cone_force(state[0], coef[2], T(m.contact_params[c][3]), last_jar, sticking)
+                    contacts[s].p = p
+                    contacts[s].jar = jar
+                    contacts[s].D = state[0]
+                    contacts[s].f = f + H * (last_jar - jar)
+                    contacts[s].H = H
                     if wp.static(TERRAIN):
-                        touches[s].E = E
+                        contacts[s].E = E
 
     @wp.func
-    def add_contacts(m: Model, here: Lane, k: int, touches: t.Contacts, load: Load):
-        """The load of link k with its contacts, linear about the iterate."""
+    def add_contacts(m: Model, here: Lane, k: int, contacts: t.Contacts, load: Load):
+        """Add link k's contacts, linear about the iterate, to its load."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             s = c - m.contact_begin[here.at]
-            if block.any_of(touches[s].on):
-                p = touches[s].p
-                H = touches[s].H
-                f = touches[s].f
+            if block.any_of(contacts[s].active):
+                p = contacts[s].p
+                H = contacts[s].H
+                f = contacts[s].f
                 if wp.static(TERRAIN):
-                    f = touches[s].E * f
-                    H = touches[s].E * H * wp.transpose(touches[s].E)
+                    f = contacts[s].E * f
+                    H = contacts[s].E * H * wp.transpose(contacts[s].E)
                 PH = wp.skew(p) * H
                 load.a = load.a - PH * wp.skew(p)
                 load.b = load.b + PH
@@ -184,10 +188,13 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return load
 
     @wp.func
-    def makes_good(less: vec3, w: T, H: mat3):
-        """(1 / w + H)^-1 less, the acceleration that makes good what a force lacks; I + w H has pivots of 1 or more."""
+    def acceleration_for(force_error: vec3, w: T, H: mat3):
+        """Return (1 / w + H)^-1 force_error, the acceleration that corrects the error of a force.
+
+        I + w H has pivots of 1 or more.
+        """
         G = w * H
-        x = w * less
+        x = w * force_error
         d = T(1.0) / (T(1.0) + G[0, 0])
         y = d * G[1, 0]
         z = d * G[2, 0]
@@ -202,147 +209,153 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return x
 
     @wp.func
-    def try_contacts(m: Model, here: Lane, k: int, step: vec6, part: T, tries: int, touches: t.Contacts):
-        """Forces and slopes after a part of a step of link k's twist; their part of what newton.measure returns."""
-        found = vec6()
+    def trial_contacts(m: Model, here: Lane, k: int, step: vec6, alpha: T, evaluation: int, contacts: t.Contacts):
+        """Evaluate link k's contacts after the trial step alpha step; returns their part of newton.evaluate_trial."""
+        total = vec6()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             s = c - m.contact_begin[here.at]
-            if block.any_of(touches[s].on):
-                by = point_velocity(step, touches[s].p)
+            if block.any_of(contacts[s].active):
+                step_jar = point_velocity(step, contacts[s].p)
                 if wp.static(TERRAIN):
-                    by = in_frame(touches[s].E, by)
-                if tries == 0:
-                    touches[s].Hs = touches[s].H * by
-                jar = touches[s].jar + part * by
-                f, H = cone(touches[s].D, constants(m, here, c)[2], T(m.contact_numbers[c][3]), jar, T(0.0))
-                less = touches[s].f - part * touches[s].Hs - f
-                w = T(m.contact_numbers[c][4])
-                away = makes_good(less, w, H)
-                found = found + vec6(
-                    wp.dot(by, less),
-                    wp.dot(by, touches[s].Hs),
-                    wp.dot(by, H * by),
-                    wp.dot(away, away),
+                    step_jar = in_frame(contacts[s].E, step_jar)
+                if evaluation == 0:
+                    contacts[s].Hs = contacts[s].H * step_jar
+                jar = contacts[s].jar + alpha * step_jar
+                friction = contact_constants(m, here, c)[2]
+                f, H = cone_force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
+                force_error = contacts[s].f - alpha * contacts[s].Hs - f
+                w = T(m.contact_params[c][4])
+                accel_error = acceleration_for(force_error, w, H)
+                total = total + vec6(
+                    wp.dot(step_jar, force_error),
+                    wp.dot(step_jar, contacts[s].Hs),
+                    wp.dot(step_jar, H * step_jar),
+                    wp.dot(accel_error, accel_error),
                     w * wp.trace(H),
                     T(0.0),
                 )
-                touches[s].tried = jar
-                touches[s].pushes = f
-                touches[s].H = H
-        return found
+                contacts[s].trial_jar = jar
+                contacts[s].trial_force = f
+                contacts[s].H = H
+        return total
 
     @wp.func
-    def keep_contacts(m: Model, here: Lane, touches: t.Contacts):
-        """The contacts of a lane are where they were tried last."""
+    def accept_contacts(m: Model, here: Lane, contacts: t.Contacts):
+        """Accept the last trial step of a lane's contacts."""
         first = m.contact_begin[here.at]
         for c in range(first, m.contact_begin[here.at + here.n]):
-            if block.any_of(touches[c - first].on):
-                touches[c - first].jar = touches[c - first].tried
-                touches[c - first].f = touches[c - first].pushes
+            if block.any_of(contacts[c - first].active):
+                contacts[c - first].jar = contacts[c - first].trial_jar
+                contacts[c - first].f = contacts[c - first].trial_force
 
     @wp.func
-    def record_contacts(m: Model, here: Lane, ck: t.Checkpoint, touches: t.Contacts):
-        """Into the checkpoint jar of all contacts of a lane, after the accelerations.
+    def record_contacts(m: Model, here: Lane, ck: t.Checkpoint, contacts: t.Contacts):
+        """Store jar of a lane's contacts in the checkpoint, after the accelerations.
 
-        It is a small difference of large numbers, of which float32 would not find the cone's zone again, and a factor
-        of one zone does not go with forces of another.
+        jar is a small difference of large numbers. Recomputed in float32 it could lie in another zone of the cone,
+        whose forces do not match the stored factor.
         """
         first = m.contact_begin[here.at]
         for c in range(first, m.contact_begin[here.at + here.n]):
             for r in range(3):
-                kin.store(ck.a, here.row, 2 * NV + 3 * c + r, here.e, touches[c - first].jar[r])
+                kin.store(ck.a, here.row, 2 * NV + 3 * c + r, here.e, contacts[c - first].jar[r])
 
     @wp.func
     def add_contacts_adjoint(
+        # model
         m: Model,
         here: Lane,
         k: int,
+        # state in
         link: Link,
         node: t.Node,
-        carrier: Place,
+        carrier: CarrierPos,
         ck: t.Checkpoint,
+        # adjoints in and out
         adj: t.Adjoint,
-        by: t.Ts,
+        adj_factors: t.Ts,
     ):
-        """The adjoints of link k with its contacts' part of phi added; by: those of factors."""
+        """Add the contacts' part of phi to link k's adjoints."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on, E, curvature = place(m, here, c, link, carrier)
-            if block.any_of(on):
-                p, _, state, of = contact_state(m, here, c, centre, distance, on, E, link.V, node.B)
+            centre, distance, active, E, curvature = locate_contact(m, here, c, link, carrier)
+            if block.any_of(active):
+                p, _, state, coef = contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
                 jar = vec3()
                 for r in range(3):
                     jar[r] = kin.load(ck.a, here.row, 2 * NV + 3 * c + r, here.e)
-                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
+                f, H = cone_force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
                 w = in_frame(E, point_velocity(node.W, p))
-                moves = in_frame(E, point_velocity(link.V, p))
+                velocity = in_frame(E, point_velocity(link.V, p))
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
                 if wp.static(VARIED):
-                    by_k = T(0.5) * of[1] * wp.dot(g_jar, moves) + g_jar[2] * state[2]
-                    by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)
-                    by[K_N] = by[K_N] + by_k / of[0]
-                    by[K_D] = by[K_D] - wp.dot(f, w) / here.k_d
-                    by[MU] = by[MU] - T(m.contact_numbers[c][2]) * by_mu
-                if wp.static(TERRAIN):  # the adjoint of the frame's angle
-                    turns = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2]))[1] - wp.cross(f, w)[1]
+                    by_k = T(0.5) * coef[1] * wp.dot(g_jar, velocity) + g_jar[2] * state[2]
+                    by_mu = friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
+                    adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
+                    adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
+                    adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
+                if wp.static(TERRAIN):  # adjoint of the frame's angle
+                    g_angle = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2]))[1] - wp.cross(f, w)[1]
                 f = in_world(E, f)
                 g_jar = in_world(E, g_jar)
                 G = force_at(p, g_jar)
                 wrench = force_at(p, f)
-                g_p = wp.cross(g_jar, wp.spatial_top(node.B) + of[1] * wp.spatial_top(link.V)) - wp.cross(
-                    f, wp.spatial_top(node.W)
-                )
+                spin = wp.spatial_top(node.B) + coef[1] * wp.spatial_top(link.V)
+                g_p = wp.cross(g_jar, spin) - wp.cross(f, wp.spatial_top(node.W))
                 adj.w = adj.w - wrench
-                adj.v = adj.v + of[1] * G
+                adj.v = adj.v + coef[1] * G
                 adj.b = adj.b + G
                 # The point follows the sphere's centre, at half its speed along the normal, which turns with it.
                 g_p = in_frame(E, g_p)
                 g_p[2] = T(0.5) * g_p[2] + g_r
                 if wp.static(TERRAIN):
                     arm = T(m.contact_radius[c]) + T(0.5) * distance
-                    g_p[0] = g_p[0] + curvature * (turns - arm * g_p[0])
+                    g_p[0] = g_p[0] + curvature * (g_angle - arm * g_p[0])
                 adj.p = adj.p + force_at(centre, in_world(E, g_p))
                 adj.p = (
-                    adj.p + wp.spatial_cross_dual(of[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
+                    adj.p + wp.spatial_cross_dual(coef[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
                 )
         return adj
 
     @wp.func
     def limit_row(m: Model, here: Lane, i: int, q: T):
-        """(D or 0 within the range, D' / D, k d r, (k d r)'), and the direction in which the joint returns."""
-        numbers = m.limit_numbers[i]
+        """Return the limit's impedance_row, with D = 0 within the range, and the sign of its J."""
+        params = m.limit_params[i]
         low = q - T(m.lower[i])
         high = T(m.upper[i]) - q
-        r = wp.min(low, high) - T(numbers[10])
+        r = wp.min(low, high) - T(params[10])
         stiffness = T(1.0)
         if wp.static(VARIED):
             stiffness = here.k_limit
-        state = row(numbers, stiffness, wp.min(r, T(0.0)))
-        on = pick(r, T(0.0), T(1.0), T(0.0))
-        return vec4(on * state[0], state[1], state[2], state[3]), pick(low, high, T(1.0), T(-1.0))
+        state = impedance_row(params, stiffness, wp.min(r, T(0.0)))
+        active = pick(r, T(0.0), T(1.0), T(0.0))
+        return vec4(active * state[0], state[1], state[2], state[3]), pick(low, high, T(1.0), T(-1.0))
 
     @wp.func
     def limit_damping(m: Model, here: Lane, i: int):
-        b = T(m.limit_numbers[i][1])
+        b = T(m.limit_params[i][1])
         if wp.static(VARIED):
             b = wp.sqrt(here.k_limit) * b
         return b
 
     @wp.func
-    def stop(m: Model, here: Lane, i: int, q: T, qd: T):
-        """Of a joint's limit (D or 0, jar without acceleration, the direction in which the joint returns)."""
-        state, way = limit_row(m, here, i, q)
-        return vec3(state[0], way * limit_damping(m, here, i) * qd + state[2], way)
+    def limit_state(m: Model, here: Lane, i: int, q: T, qd: T):
+        """Return the limit's (D, jar without acceleration, sign of J)."""
+        state, sign = limit_row(m, here, i, q)
+        return vec3(state[0], sign * limit_damping(m, here, i) * qd + state[2], sign)
 
     @wp.func
-    def joint_constraint(m: Model, i: int, stop: vec3, qd: T, qdd: T, stuck: T):
-        """(force of the limit and of dry friction on the joint, minus its derivative in qdd); stuck as of cone."""
+    def joint_constraint(m: Model, i: int, limit: vec3, qd: T, qdd: T, sticking: T):
+        """Return the force of the limit and of dry friction on the joint, and minus its derivative in qdd.
+
+        Where sticking is 1, the limit has its slope whatever jar is.
+        """
         force = T(0.0)
         slope = T(0.0)
         if wp.static(LIMIT):
-            jar = stop[2] * qdd + stop[1]
-            slope = pick(jar, T(0.0), stop[0], stuck * stop[0])
-            force = -stop[2] * slope * jar
+            jar = limit[2] * qdd + limit[1]
+            slope = pick(jar, T(0.0), limit[0], sticking * limit[0])
+            force = -limit[2] * slope * jar
         if wp.static(LOSS):
             loss = m.joint_loss[i]
             f = -T(loss[1]) * (qdd + T(loss[2]) * qd)
@@ -352,21 +365,21 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec2(force, slope)
 
     @wp.func
-    def joint_gain(m: Model, here: Lane, i: int, q: T, qd: T, qdd: T):
-        """Derivatives of that force with respect to q, qd and the factor of k_limit."""
-        gain = vec3()
+    def joint_derivatives(m: Model, here: Lane, i: int, q: T, qd: T, qdd: T):
+        """Differentiate that force with respect to q, qd and the factor of k_limit."""
+        derivatives = vec3()
         if wp.static(LIMIT):
-            state, way = limit_row(m, here, i, q)
+            state, sign = limit_row(m, here, i, q)
             b = limit_damping(m, here, i)
-            jar = way * (qdd + b * qd) + state[2]
+            jar = sign * (qdd + b * qd) + state[2]
             D = pick(jar, T(0.0), state[0], T(0.0))
-            gain = -D * vec3(state[3] + jar * state[1], b, T(0.0))
+            derivatives = -D * vec3(state[3] + jar * state[1], b, T(0.0))
             if wp.static(VARIED):
-                gain[2] = -D * (T(0.5) * b * qd + way * state[2]) / here.k_limit
+                derivatives[2] = -D * (T(0.5) * b * qd + sign * state[2]) / here.k_limit
         if wp.static(LOSS):
             loss = m.joint_loss[i]
             f = T(loss[1]) * (qdd + T(loss[2]) * qd)
-            gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
-        return gain
+            derivatives[1] = derivatives[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
+        return derivatives
 
     return functions(locals())

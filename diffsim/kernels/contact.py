@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.factors import K_D, K_N, K_T, MU
+from diffsim.kernels.lane import K_D, K_N, K_T, MU
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -31,49 +31,54 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
     T, vec3, vec4, Model, Lane, Link = t.T, t.vec3, t.vec4, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
-    Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
+    CarrierPos, force_at, point_velocity, pick = t.CarrierPos, sp.force_at, sp.point_velocity, block.pick
     ground, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, VARIED, in_frame, in_world = spec.implicit, spec.varied, ground.in_frame, ground.in_world
 
     @wp.func
-    def sphere_state(m: Model, here: Lane, c: int, link: Link, place: Place):
-        """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth, E, and the
-        ground's curvature in it."""
+    def sphere_state(m: Model, here: Lane, c: int, link: Link, carrier: CarrierPos):
+        """Compute the contact point of sphere c.
+
+        Returns:
+            its point p nearest to the ground, the velocity of p in the frame E, the depth, E, and the ground's
+            curvature in it.
+        """
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         r = T(m.contact_radius[c])
-        depth, E, curvature = ground.distance(m, here, c, centre, place, r)
+        depth, E, curvature = ground.distance(m, here, c, centre, carrier, r)
         p = centre - in_world(E, vec3(T(0.0), T(0.0), r))
         v = in_frame(E, point_velocity(link.V, p))
         return p, v, depth, E, curvature
 
     @wp.func
-    def touches(here: Lane, d: T, v: vec3):
-        """1 where the ground pushes, else 0."""
+    def is_active(here: Lane, d: T, v: vec3):
+        """Return 1 where the normal force is positive, else 0."""
         return pick(d, T(0.0), pick(here.k_d * v[2], here.k_n, T(1.0), T(0.0)), T(0.0))
 
     @wp.func
     def friction_viscosity(here: Lane, f_n: T, v: vec3):
-        """(c, 1 if sliding else 0)."""
+        """Return the viscosity c of friction, and 1 where the sphere slides, else 0."""
         speed = wp.sqrt(v[0] * v[0] + v[1] * v[1])
-        most = here.mu * f_n
+        friction_limit = here.mu * f_n
         viscous = here.k_t * speed
-        return pick(most, viscous, most / speed, here.k_t), pick(most, viscous, T(1.0), T(0.0))
+        sliding = pick(friction_limit, viscous, T(1.0), T(0.0))
+        return pick(friction_limit, viscous, friction_limit / speed, here.k_t), sliding
 
     @wp.func
     def contact_force(here: Lane, d: T, v: vec3):
-        """Force on the sphere, and the effective viscosity c of friction, as (f, c)."""
+        """Return the force on the sphere and the effective viscosity c of friction, as (f, c)."""
         f_n = (here.k_d * v[2] - here.k_n) * d
         c, sliding = friction_viscosity(here, f_n, v)
         return vec4(-c * v[0], -c * v[1], f_n, c)
 
     @wp.func
     def contact_resistance(here: Lane, d: T, c: T):
-        """The diagonal of B."""
+        """Return the diagonal of B."""
         return vec3(here.h * c, here.h * c, -here.h * here.k_d * d)
 
     @wp.func
     def contact_adjoint(here: Lane, d: T, v: vec3, a: vec3, g: vec3, h: T):
-        """(adjoint of v, adjoint of d) of g . f(d, v, a); h = 0 if explicit."""
+        """Return the adjoints of v and of d in g . f(d, v, a); h = 0 if explicit."""
         s = here.k_d * v[2] - here.k_n
         f_n = s * d
         c, sliding = friction_viscosity(here, f_n, v)
@@ -91,7 +96,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def contact_constants_adjoint(here: Lane, d: T, v: vec3, a: vec3, g: vec3, h: T):
-        """The adjoints of (k_n, k_d, k_t, mu); arguments as of contact_adjoint."""
+        """Return the adjoints of (k_n, k_d, k_t, mu); arguments as in contact_adjoint."""
         f_n = (here.k_d * v[2] - here.k_n) * d
         c, sliding = friction_viscosity(here, f_n, v)
         g_c = -(g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
@@ -102,17 +107,17 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(-g_n * d, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
     @wp.func
-    def add_contacts(m: Model, here: Lane, k: int, link: Link, place: Place, load: t.Load):
-        """The load of link k with its contacts."""
+    def add_contacts(m: Model, here: Lane, k: int, link: Link, carrier: CarrierPos, load: t.Load):
+        """Add link k's contacts to its load."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            p, v, depth, E, _ = sphere_state(m, here, c, link, place)
-            on = touches(here, depth, v)
-            if block.any_of(on):
-                depth = on * depth  # no force on the others, as it grows with the depth
+            p, v, depth, E, _ = sphere_state(m, here, c, link, carrier)
+            active = is_active(here, depth, v)
+            if block.any_of(active):
+                depth = active * depth  # 0 on inactive spheres, and so is their force
                 fc = contact_force(here, depth, v)
                 f = in_world(E, vec3(fc[0], fc[1], fc[2]))
                 if wp.static(IMPLICIT):
-                    B = on * contact_resistance(here, depth, fc[3])
+                    B = active * contact_resistance(here, depth, fc[3])
                     if wp.static(TERRAIN):
                         D = E * wp.diag(B) * wp.transpose(E)
                         f = f - D * vec3(m.gravity)
@@ -128,23 +133,33 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_contacts_adjoint(
-        m: Model, here: Lane, k: int, link: Link, node: Node, place: Place, adj: Adjoint, adj_factors: Array
+        # model
+        m: Model,
+        here: Lane,
+        k: int,
+        # state in
+        link: Link,
+        node: Node,
+        carrier: CarrierPos,
+        # adjoints in and out
+        adj: Adjoint,
+        adj_factors: Array,
     ):
-        """The adjoints of link k with its contacts' part of phi added."""
+        """Add the contacts' part of phi to link k's adjoints."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            p, v, depth, E, curvature = sphere_state(m, here, c, link, place)
-            on = touches(here, depth, v)
-            if block.any_of(on):
-                depth = on * depth  # no force on the others, as it grows with the depth
+            p, v, depth, E, curvature = sphere_state(m, here, c, link, carrier)
+            active = is_active(here, depth, v)
+            if block.any_of(active):
+                depth = active * depth  # 0 on inactive spheres, and so is their force
                 fc = contact_force(here, depth, v)
                 f = vec3(fc[0], fc[1], fc[2])
-                g_f = in_frame(E, -on * point_velocity(node.W, p))
+                g_f = in_frame(E, -active * point_velocity(node.W, p))
                 a = vec3()
                 hi = T(0.0)
                 if wp.static(IMPLICIT):
                     hi = here.h
                     a = in_frame(E, point_velocity(node.A, p) + vec3(m.gravity))
-                    B = on * contact_resistance(here, depth, fc[3])
+                    B = active * contact_resistance(here, depth, fc[3])
                     f = f - wp.cw_mul(B, a)
                 g = contact_adjoint(here, depth, v, a, g_f, hi)
                 if wp.static(VARIED):

@@ -1,14 +1,14 @@
 """The drag of a fluid at rest on one link, MuJoCo's inertia-box law, and its adjoint.
 
-A link feels drag as the box of uniform density that has its inertia. In the box's principal axes, with velocity l of
-the centre of mass and angular velocity w, each component by itself,
+Drag acts on a link as on the box of uniform density that has its inertia. In the box's principal axes, with velocity l
+of the centre of mass and angular velocity w, for each component,
 
     f = -(a l + b |l| l),   torque = -(c w + d |w| w),
 
 with a and c the viscous drag of a sphere of the box's mean side, b and d the pressure on its faces (Scene.drag).
 
-The law does not know where the link is: turned together with all its motion, it is the same. So like the inertial part
-of phi it has no adjoint of the pose, only one of the velocity (backward.py). Both integrators take it explicitly.
+The law is invariant under a rotation of the link together with its motion. So like the inertial part of phi it has no
+adjoint of the pose, only one of the velocity (backward.py). Both integrators treat it explicitly.
 """
 
 from functools import cache
@@ -29,12 +29,12 @@ def drag_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def wrench(F: mat3, com: vec3, force: vec3, torque: vec3):
-        """Of a force through com and a torque, both in the box's axes F."""
+        """Return the wrench of a force through com and a torque, both in the box's axes F."""
         return force_at(com, F * force) + join(F * torque, vec3())
 
     @wp.func
     def drag_wrench(m: Model, i: int, R: mat3, com: vec3, V: vec6):
-        """The fluid's wrench on link i, whose centre of mass is at com."""
+        """Return the fluid's wrench on link i, whose centre of mass is at com."""
         F = R * mat3(m.drag_frame[i])
         l = wp.transpose(F) * point_velocity(V, com)
         w = wp.transpose(F) * wp.spatial_top(V)
@@ -44,7 +44,7 @@ def drag_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def drag_adjoint(m: Model, i: int, R: mat3, com: vec3, V: vec6, W: vec6):
-        """Adjoint of V of -W . drag_wrench(V)."""
+        """Return the adjoint of V of -W . drag_wrench(V)."""
         F = R * mat3(m.drag_frame[i])
         l = wp.transpose(F) * point_velocity(V, com)
         w = wp.transpose(F) * wp.spatial_top(V)

@@ -1,6 +1,7 @@
-"""Sums over the lanes that share an environment (lanes.py); all of them must call these functions together.
+"""Sum over the lanes that share an environment (lanes.py); all of them must call these functions together.
 
-A butterfly adds the same numbers in the same tree on every lane: what lanes have in common stays equal to the last bit.
+A butterfly adds the same numbers in the same tree on every lane. So values that lanes have in common stay equal bit for
+bit.
 """
 
 from functools import cache
@@ -26,16 +27,16 @@ def lane_sums(spec: KernelSpec) -> SimpleNamespace:
 """
 
     @wp.func_native(neighbour)
-    def of_neighbour(value: T, offset: int) -> T: ...
+    def shuffle_xor(value: T, offset: int) -> T: ...
 
     def sums(offsets: list[int], last: int) -> SimpleNamespace:
-        """Of a number, of inertias and forces with them, and of spatial vectors: the links' up to `last`."""
+        """Make sums of a number, and of the loads, twists and adjoints of the links up to `last`."""
         steps, least, inertial = len(offsets), offsets[0] if offsets else 1, 0 if spec.floating else 1 + spec.inert
 
         @wp.func
         def add(value: T):
             for k in range(steps):
-                value = value + of_neighbour(value, least << k)
+                value = value + shuffle_xor(value, least << k)
             return value
 
         @wp.func

@@ -1,13 +1,13 @@
 """External wrenches on bodies, MuJoCo's xfrc_applied, and their adjoint.
 
-The array `forces` has six columns for each body, force f and torque in world axes at the body's centre of mass p; it
-has none in kernels without forces. The wrench is constant over a control step, p moves with the body. In phi
+The array `forces` has six columns for each body: force f and torque in world axes at the body's centre of mass p. It
+has none in kernels without forces. The wrench is constant over a control step, and p moves with the body. In phi
 (backward.py) it is the term -W . wrench, with the derivatives
 
     d/df = -(velocity of p under W),   d/dtorque = -(angular part of W),   d/dp = -f x (angular part of W).
 
-Both integrators take the wrench as it is at the start of a substep, like gravity: it depends on the pose alone, and on
-that only through its lever arm.
+Both integrators evaluate the wrench at the start of a substep, like gravity: it depends on the pose only, through its
+lever arm.
 """
 
 from functools import cache
@@ -27,11 +27,11 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, Model, Lane, block = t.T, t.vec3, t.Model, t.Lane, blocks(spec)
     Links, Nodes, Adjoints = t.Links, t.Nodes, t.Adjoints
     join, force_at, point_velocity, read = sp.join, sp.force_at, sp.point_velocity, block.read
-    FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base feels no force
+    FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base does not move
 
     @wp.func
-    def external(forces: t.array2, e: int, body: int, p: vec3):
-        """The force on a body, and the wrench about the carrier."""
+    def external_wrench(forces: t.array2, e: int, body: int, p: vec3):
+        """Return the force on a body, and the wrench about the carrier."""
         k = 6 * body
         f = vec3(read(forces, e, k), read(forces, e, k + 1), read(forces, e, k + 2))
         torque = vec3(read(forces, e, k + 3), read(forces, e, k + 4), read(forces, e, k + 5))
@@ -39,24 +39,23 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_forces(m: Model, here: Lane, forces: t.array2, links: Links, loads: t.Loads):
-        """Adds the forces to the links' bias forces."""
+        """Add the forces to the links' bias forces."""
         for i in range(FIRST, here.n):
             for entry in range(m.body_begin[here.at + i], m.body_begin[here.at + i + 1]):
-                f, wrench = external(
-                    forces, here.e, m.body[entry], sp.on_link(links[i].R, links[i].x, m.body_com[entry])
-                )
+                p = sp.on_link(links[i].R, links[i].x, m.body_com[entry])
+                f, wrench = external_wrench(forces, here.e, m.body[entry], p)
                 loads[i].f = loads[i].f - wrench
 
     @wp.func
     def add_forces_adjoint(
         m: Model, here: Lane, forces: t.array2, links: Links, nodes: Nodes, adj: Adjoints, adj_forces: t.vec6s
     ):
-        """Adds the forces' part of phi to the links' adjoints; adj_forces: of each body, (force, torque)."""
+        """Add the forces' part of phi to the links' adjoints and to adj_forces, (force, torque) of each body."""
         for i in range(FIRST, here.n):
             for entry in range(m.body_begin[here.at + i], m.body_begin[here.at + i + 1]):
                 body = m.body[entry]
                 p = sp.on_link(links[i].R, links[i].x, m.body_com[entry])
-                f, wrench = external(forces, here.e, body, p)
+                f, wrench = external_wrench(forces, here.e, body, p)
                 W = nodes[i].W
                 turn = wp.spatial_top(W)
                 adj[i].w = adj[i].w - wrench
@@ -64,12 +63,12 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
                 adj_forces[body] = adj_forces[body] - join(point_velocity(W, p), turn)
 
     @wp.func
-    def broken_forces(m: Model, here: Lane, adj_forces: t.vec6s):
-        """How many numbers of the adjoints of the forces on this lane's bodies are not finite."""
+    def count_nonfinite_forces(m: Model, here: Lane, adj_forces: t.vec6s):
+        """Count numbers that are not finite among the adjoints of the forces on this lane's bodies."""
         result = T(0.0)
         for entry in range(m.body_begin[here.at], m.body_begin[here.at + SLOTS]):
             for k in range(6):
-                result = result + block.broken(adj_forces[m.body[entry]][k])
+                result = result + block.is_nonfinite(adj_forces[m.body[entry]][k])
         return result
 
     @wp.func

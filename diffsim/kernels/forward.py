@@ -1,6 +1,6 @@
 """One control step: all substeps of all environments in one launch.
 
-On a GPU an environment has one thread or several (lanes.py). On a CPU one thread serves a block of them (wide.py).
+On a GPU one thread or several simulate an environment (lanes.py). On a CPU one thread simulates a block (wide.py).
 
 A substep is Featherstone's articulated-body algorithm (RBDA, Table 7.1) about the carrier's current position in world
 axes, then semi-implicit Euler with the exact quaternion exponential. Its factorisation (U and 1/d of each joint, the
@@ -13,17 +13,17 @@ import warp as wp
 
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.factors import lane_of
 from diffsim.kernels.force import external_force
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.lane import lane_of
 from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.newton import newton_method
 from diffsim.kernels.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
 from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import FAR, MAX_PLACE, MAX_SPEED, KernelSpec
+from diffsim.kernels.spec import FAR, MAX_POSITION, MAX_SPEED, KernelSpec
 from diffsim.kernels.wide import blocks, module_options
 
 
@@ -43,14 +43,15 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NU, FLOATING, FORCED = spec.nu, spec.floating, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
-    NBALL, LIMIT = spec.nball, MAX_SPEED
+    NBALL = spec.nball
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.slots
-    SPHERES, BALLS, PULLS = max(spec.spheres, 1), max(NBALL, 1), NU if MUSCLE else 1  # no array has none
+    # Local arrays have at least one element, also where they are not read.
+    SPHERES, BALLS, TENSIONS = max(spec.spheres, 1), max(NBALL, 1), NU if MUSCLE else 1
 
     @wp.func
-    def state_of(m: Model, here: Lane, batch: t.Batch, links: Links, turn: Quats):
-        """Into links and turn the joints' state; returns the floating base's."""
+    def read_state(m: Model, here: Lane, batch: t.Batch, links: Links, ball_rot: Quats):
+        """Read the joints' state into links and ball_rot; returns the floating base's."""
         e = here.e
         for i in range(1, here.n):
             links[i].q = read(batch.qpos, e, qpos_adr(m, here.at + i))
@@ -58,7 +59,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 adr = qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b])
-                turn[b] = wp.normalize(kin.load_quat(batch.qpos, e, adr))
+                ball_rot[b] = wp.normalize(kin.load_quat(batch.qpos, e, adr))
         links[0].R = wp.identity(3, dtype=T)
         root = Root()
         if wp.static(FLOATING):
@@ -69,8 +70,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         return root
 
     @wp.func
-    def record_state(m: Model, here: Lane, ck: Ck, links: Links, turn: Quats, root: Root):
-        """Into the checkpoint the state at the start of the substep."""
+    def record_state(m: Model, here: Lane, ck: Ck, links: Links, ball_rot: Quats, root: Root):
+        """Store the state at the start of the substep in the checkpoint."""
         e = here.e
         if wp.static(FLOATING):
             for k in range(3):
@@ -85,13 +86,13 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 adr = qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b])
-                store(ck.q, here.row, adr, e, turn[b][3])
+                store(ck.q, here.row, adr, e, ball_rot[b][3])
                 for k in range(3):
-                    store(ck.q, here.row, adr + 1 + k, e, turn[b][k])
+                    store(ck.q, here.row, adr + 1 + k, e, ball_rot[b][k])
 
     @wp.func
-    def record_rates(m: Model, here: Lane, ck: Ck, column: int, vdot: vec3, wdot: vec3, motions: Motions):
-        """Into the checkpoint accelerations, from a column on: the base's, and those in motions' u."""
+    def record_accelerations(m: Model, here: Lane, ck: Ck, column: int, vdot: vec3, wdot: vec3, motions: Motions):
+        """Store accelerations in the checkpoint, from a column on: the base's, then those in motions' u."""
         if wp.static(FLOATING):
             for k in range(3):
                 store(ck.a, here.row, column + k, here.e, vdot[k])
@@ -100,8 +101,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             store(ck.a, here.row, column + VADR + link_of(m, here.at + i), here.e, motions[i].u)
 
     @wp.func
-    def outward(m: Model, here: Lane, place: t.Place, links: Links, motions: Motions, loads: Loads):
-        """Velocity products, inertias and bias forces of links that are placed."""
+    def outward(m: Model, here: Lane, carrier: t.CarrierPos, links: Links, motions: Motions, loads: Loads):
+        """Compute the links' velocity products, inertias and bias forces from their kinematics."""
         for i in range(1, here.n):
             turning = i
             if wp.static(NBALL > 0):
@@ -110,119 +111,123 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         for i in range(1, INERT + 1):
             loads[i] = Load()
         for i in range(FIRST, here.n):
-            loads[i] = link.link_inertia(m, here, here.at + i, links[i], place)
+            loads[i] = link.link_inertia(m, here, here.at + i, links[i], carrier)
 
     @wp.func
-    def moved(place: T, rate: T, rest: T, h: T):
-        """(The place after a substep, what rounding it lost so far), which is made good where the place is far off."""
-        end = place + h * rate
-        far = pick(T(FAR), wp.abs(end), T(1.0), T(0.0))
-        if block.any_of(far):
-            rest = far * (rest + (rate - (end - place) / h) * h)
-            whole = end + rest
-            rest = rest - (whole - end)
-            end = pick(T(0.0), far, whole, end)
-        return end, rest
+    def advance_position(position: T, velocity: T, rounding_error: T, h: T):
+        """Return the position after a substep and its rounding error so far, which is compensated beyond FAR."""
+        end = position + h * velocity
+        distant = pick(T(FAR), wp.abs(end), T(1.0), T(0.0))
+        if block.any_of(distant):
+            rounding_error = distant * (rounding_error + (velocity - (end - position) / h) * h)
+            compensated = end + rounding_error
+            rounding_error = rounding_error - (compensated - end)
+            end = pick(T(0.0), distant, compensated, end)
+        return end, rounding_error
 
     @wp.func
-    def integrate(m: Model, here: Lane, links: Links, motions: Motions, turn: Quats, root: Root):
+    def integrate(m: Model, here: Lane, links: Links, motions: Motions, ball_rot: Quats, root: Root):
         h = here.h
         if wp.static(FLOATING):
-            root.v = root.v + h * root.speeding_up
-            root.w = root.w + h * root.turning_up
+            root.v = root.v + h * root.vdot
+            root.w = root.w + h * root.wdot
             for k in range(3):
-                end, rest = moved(root.pos[k], root.v[k], root.rest[k], h)
+                end, rounding_error = advance_position(root.pos[k], root.v[k], root.rounding_error[k], h)
                 root.pos[k] = end
-                root.rest[k] = rest
+                root.rounding_error[k] = rounding_error
             root.rot = wp.normalize(root.rot * exp_quat(h * root.w))
         for i in range(1, here.n):
             links[i].qd = links[i].qd + h * motions[i].u
-            end, rest = moved(links[i].q, links[i].qd, motions[i].rest, h)
+            end, rounding_error = advance_position(links[i].q, links[i].qd, motions[i].rounding_error, h)
             links[i].q = end
-            motions[i].rest = rest
+            motions[i].rounding_error = rounding_error
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 i = m.ball_slot[here.lane * NBALL + b]
-                turn[b] = wp.normalize(turn[b] * exp_quat(h * vec3(links[i].qd, links[i + 1].qd, links[i + 2].qd)))
+                velocity = vec3(links[i].qd, links[i + 1].qd, links[i + 2].qd)
+                ball_rot[b] = wp.normalize(ball_rot[b] * exp_quat(h * velocity))
         return root
 
     @wp.func
-    def too_fast(rate: T):
-        """1 where a rate is beyond any imaginable one, or no number, else 0."""
-        return pick(wp.abs(rate), T(LIMIT), T(0.0), T(1.0))
+    def exceeds_speed(velocity: T):
+        """Return 1 where a velocity is beyond MAX_SPEED or NaN, else 0."""
+        return pick(wp.abs(velocity), T(MAX_SPEED), T(0.0), T(1.0))
 
     @wp.func
-    def too_far(place: T):
-        """1 where a place is too far off for float32, or no number, else 0."""
-        return pick(wp.abs(place), T(MAX_PLACE), T(0.0), T(1.0))
+    def exceeds_range(position: T):
+        """Return 1 where a position is beyond MAX_POSITION or NaN, else 0."""
+        return pick(wp.abs(position), T(MAX_POSITION), T(0.0), T(1.0))
 
     @wp.func
-    def no_turn(batch: t.Batch, here: Lane, adr: int):
-        """1 where the square of a quaternion that came in is near the ends of float32, or no number, else 0."""
-        given = kin.load_quat(batch.qpos, here.e, adr)
-        square = wp.dot(given, given)
+    def invalid_quaternion(batch: t.Batch, here: Lane, adr: int):
+        """Return 1 where an input quaternion's square is near the ends of float32's range or NaN, else 0."""
+        quaternion = kin.load_quat(batch.qpos, here.e, adr)
+        square = wp.dot(quaternion, quaternion)
         return pick(T(1e-30), square, pick(square, T(1e30), T(0.0), T(1.0)), T(1.0))
 
     @wp.func
-    def broken_numbers(m: Model, here: Lane, batch: t.Batch, links: Links, turn: Quats, root: Root):
-        """How many numbers of the state left the finite ones, or any imaginable speed, or came in without direction."""
-        broken = T(0.0)
+    def count_nonfinite(m: Model, here: Lane, batch: t.Batch, links: Links, ball_rot: Quats, root: Root):
+        """Count numbers of the state that are not finite or out of bounds, and invalid input quaternions."""
+        failed = T(0.0)
         if wp.static(FLOATING):
             for k in range(3):
-                broken = broken + too_far(root.pos[k]) + block.broken(root.rot[k])
-                broken = broken + too_fast(root.v[k]) + too_fast(root.w[k])
-            broken = broken + block.broken(root.rot[3]) + no_turn(batch, here, 3)
+                failed = failed + exceeds_range(root.pos[k]) + block.is_nonfinite(root.rot[k])
+                failed = failed + exceeds_speed(root.v[k]) + exceeds_speed(root.w[k])
+            failed = failed + block.is_nonfinite(root.rot[3]) + invalid_quaternion(batch, here, 3)
         for i in range(1, here.n):
-            broken = broken + too_far(links[i].q) + too_fast(links[i].qd)
-        if wp.static(NBALL > 0):
-            for b in range(m.ball_count[here.lane]):
-                broken = broken + no_turn(batch, here, qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b]))
-                for k in range(4):
-                    broken = broken + block.broken(turn[b][k])
-        if wp.static(THREADS_PER_ENV > 1):
-            broken = sums.add(broken)
-        return broken
-
-    @wp.func
-    def hand_back(out: t.array2, start: t.array2, e: int, column: int, broken: T, value: T):
-        """Writes the value, but what it was at the start to broken environments."""
-        write(out, e, column, pick(T(0.0), broken, read(start, e, column), value))
-
-    @wp.func
-    def write_state(m: Model, here: Lane, broken: T, batch: t.Batch, links: Links, turn: Quats, root: Root):
-        e = here.e
-        if wp.static(FLOATING):
-            for k in range(3):
-                hand_back(batch.qpos_out, batch.qpos, e, k, broken, root.pos[k])
-                hand_back(batch.qpos_out, batch.qpos, e, 4 + k, broken, root.rot[k])
-                hand_back(batch.qvel_out, batch.qvel, e, k, broken, root.v[k])
-                hand_back(batch.qvel_out, batch.qvel, e, 3 + k, broken, root.w[k])
-            hand_back(batch.qpos_out, batch.qpos, e, 3, broken, root.rot[3])
-        for i in range(1, here.n):
-            hand_back(batch.qpos_out, batch.qpos, e, qpos_adr(m, here.at + i), broken, links[i].q)
-            hand_back(batch.qvel_out, batch.qvel, e, VADR + link_of(m, here.at + i), broken, links[i].qd)
+            failed = failed + exceeds_range(links[i].q) + exceeds_speed(links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 adr = qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b])
-                hand_back(batch.qpos_out, batch.qpos, e, adr, broken, turn[b][3])
+                failed = failed + invalid_quaternion(batch, here, adr)
+                for k in range(4):
+                    failed = failed + block.is_nonfinite(ball_rot[b][k])
+        if wp.static(THREADS_PER_ENV > 1):
+            failed = sums.add(failed)
+        return failed
+
+    @wp.func
+    def write_or_restore(out: t.array2, start: t.array2, e: int, column: int, failed: T, value: T):
+        """Write the value, and in failed environments the value before the step."""
+        write(out, e, column, pick(T(0.0), failed, read(start, e, column), value))
+
+    @wp.func
+    def write_state(m: Model, here: Lane, failed: T, batch: t.Batch, links: Links, ball_rot: Quats, root: Root):
+        e = here.e
+        if wp.static(FLOATING):
+            for k in range(3):
+                write_or_restore(batch.qpos_out, batch.qpos, e, k, failed, root.pos[k])
+                write_or_restore(batch.qpos_out, batch.qpos, e, 4 + k, failed, root.rot[k])
+                write_or_restore(batch.qvel_out, batch.qvel, e, k, failed, root.v[k])
+                write_or_restore(batch.qvel_out, batch.qvel, e, 3 + k, failed, root.w[k])
+            write_or_restore(batch.qpos_out, batch.qpos, e, 3, failed, root.rot[3])
+        for i in range(1, here.n):
+            write_or_restore(batch.qpos_out, batch.qpos, e, qpos_adr(m, here.at + i), failed, links[i].q)
+            write_or_restore(batch.qvel_out, batch.qvel, e, VADR + link_of(m, here.at + i), failed, links[i].qd)
+        if wp.static(NBALL > 0):
+            for b in range(m.ball_count[here.lane]):
+                adr = qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b])
+                write_or_restore(batch.qpos_out, batch.qpos, e, adr, failed, ball_rot[b][3])
                 for k in range(3):
-                    hand_back(batch.qpos_out, batch.qpos, e, adr + 1 + k, broken, turn[b][k])
+                    write_or_restore(batch.qpos_out, batch.qpos, e, adr + 1 + k, failed, ball_rot[b][k])
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def forward(
         # model
         m: Model,
         first: int,  # block of this launch
-        seconds: t.U,  # of a substep
+        # options
+        seconds: t.U,  # length of a substep
         substeps: int,
-        passes: int,  # of Newton's method at most, and what it converges to: read with constraints
-        tolerance: t.U,
+        passes: int,  # of Newton's method at most, read with constraints
+        tolerance: t.U,  # of its residual, read with constraints
+        # state in and out
         batch: t.Batch,
-        # checkpoint out: rows row0 .. row0 + substeps - 1, written if record is 1
-        record: int,
+        # checkpoint out: rows row0 .. row0 + substeps - 1
+        record: int,  # 1 if they are written
         row0: int,
         ck: t.Checkpoint,
-        # out; with constraints the last column of qvel_out is the residual
+        # out
         nonfinite: wp.array(dtype=wp.bool),
         unconverged: wp.array(dtype=int),
     ):
@@ -230,111 +235,113 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         links = wp.zeros(shape=SLOTS, dtype=Link)
         motions = wp.zeros(shape=SLOTS, dtype=Motion)
         loads = wp.zeros(shape=SLOTS, dtype=Load)
-        turn = wp.zeros(shape=BALLS, dtype=quat)
-        pull = wp.zeros(shape=PULLS, dtype=T)
+        ball_rot = wp.zeros(shape=BALLS, dtype=quat)
+        tension = wp.zeros(shape=TENSIONS, dtype=T)
         if wp.static(MUSCLE):
-            muscle.activate(m, here, batch.ctrl, pull)
+            muscle.compute_tensions(m, here, batch.ctrl, tension)
         if wp.static(MOTOR):
-            joint.drive(m, here, batch.ctrl, motions)
+            joint.motors_forward(m, here, batch.ctrl, motions)
         if wp.static(CONSTRAINED):
-            free = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
-            touches = wp.zeros(shape=SPHERES, dtype=Contact)
+            free_loads = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
+            contacts = wp.zeros(shape=SPHERES, dtype=Contact)
             residual = T(0.0)
-        root = state_of(m, here, batch, links, turn)
+        root = read_state(m, here, batch, links, ball_rot)
         for sub in range(substeps):
             here.row = row0 + sub
             if record == 1:
-                record_state(m, here, ck, links, turn, root)
+                record_state(m, here, ck, links, ball_rot, root)
             # 1. outward: poses, velocities, velocity products, inertias and bias forces
-            place = kin.carrier_place(m, T(0.0), T(0.0))
+            carrier = kin.carrier_position(m, T(0.0), T(0.0))
             if wp.static(FLOATING):
                 links[0].R = wp.quat_to_matrix(root.rot)
                 links[0].V = join(links[0].R * root.w, root.v)
-                place = kin.carrier_place(m, root.pos[0], root.pos[2])
+                carrier = kin.carrier_position(m, root.pos[0], root.pos[2])
             if wp.static(NBALL > 0):
-                kin.place_balls(m, here, turn, links)
-            place = kin.place_links(m, here, links, place)
-            outward(m, here, place, links, motions, loads)
+                kin.place_balls(m, here, ball_rot, links)
+            carrier = kin.place_links(m, here, links, carrier)
+            outward(m, here, carrier, links, motions, loads)
             if wp.static(FORCED):
                 force.add_forces(m, here, batch.forces, links, loads)
             if wp.static(MUSCLE):
-                muscle.add_muscles(m, here, pull, links, loads)
+                muscle.add_muscles(m, here, tension, links, loads)
             # 2. inward and outward: articulated inertias, then accelerations. With constraints each pass is a step of
-            # Newton's method (newton.py); the adjoint has the factor where it ends. MuJoCo's
-            # implicit damping is one solve more: (M + h b) change = -h b a.
+            # Newton's method (newton.py), and the adjoint uses the factor of the last iterate. MuJoCo's implicit
+            # damping is one more solve: (M + h b) change = -h b a.
             if wp.static(CONSTRAINED):
-                by = Newton()
-                by.tolerance = T(tolerance)
-                by.going = T(1.0)
-                by.size = T(1.0)
-                root.vdot = vec3()
+                status = Newton()
+                status.tolerance = T(tolerance)
+                status.active = T(1.0)
+                status.accel_sq = T(1.0)
+                root.newton_vdot = vec3()
+                root.newton_wdot = vec3()
                 root.wdot = vec3()
-                root.turning_up = vec3()
-                root.speeding_up = vec3()
+                root.vdot = vec3()
                 if wp.static(CONTACT):
-                    constraint.touch(m, here, links, place, touches)
-                newton.begin(m, here, links, motions, loads, free, root)
+                    constraint.begin_contacts(m, here, links, carrier, contacts)
+                newton.initialize(m, here, links, motions, loads, free_loads, root)
                 phase = int(NEWTON)
                 while phase < DONE:
-                    if phase == NEWTON and (by.passes == passes or not block.any_of(by.going)):
-                        residual = wp.max(residual, by.off)
+                    if phase == NEWTON and (status.passes == passes or not block.any_of(status.active)):
+                        residual = wp.max(residual, status.residual_sq)
                         phase = DONE - int(DAMPED)
                         if record == 1:
                             phase = FACTOR
                     if phase < DONE:
-                        here.factor = SOLVES * here.row
+                        here.factor_row = SOLVES * here.row
                         if wp.static(DAMPED):
                             if phase == FACTOR:
-                                here.factor = here.factor + 1
+                                here.factor_row = here.factor_row + 1
                         if phase == SOLVE:
                             for i in range(here.n):
-                                loads[i] = free[i]
+                                loads[i] = free_loads[i]
                                 loads[i].f = vec6()
                         else:
-                            newton.linearize(m, here, motions, touches, free, loads)
-                        here.keep = record * wp.where(phase > NEWTON, 1, 0)
+                            newton.linearize(m, here, motions, contacts, free_loads, loads)
+                        here.store_factor = record * wp.where(phase > NEWTON, 1, 0)
                         sweep.inward(m, here, phase, ck, links, motions, loads)
                         root = sweep.accelerate(m, here, phase, ck, links, motions, loads[0], root)
                         if phase == NEWTON:
-                            root, by = newton.step_on(m, here, links, motions, touches, free, root, by)
+                            root, status = newton.newton_step(
+                                m, here, links, free_loads, motions, contacts, root, status
+                            )
                         else:
                             phase = phase + 1
                             if wp.static(not DAMPED):
                                 phase = DONE
                 for i in range(1, here.n):
                     change = motions[i].u
-                    motions[i].u = motions[i].rate
+                    motions[i].u = motions[i].accel_joint
                     if wp.static(DAMPED):
-                        motions[i].rate = motions[i].rate + change
-                if record == 1:  # the acceleration of the constraints, of which the adjoint is
-                    record_rates(m, here, ck, NV, root.vdot, root.wdot, motions)
+                        motions[i].accel_joint = motions[i].accel_joint + change
+                if record == 1:  # the acceleration before damping, at which the adjoint differentiates the constraints
+                    record_accelerations(m, here, ck, NV, root.newton_vdot, root.newton_wdot, motions)
                     if wp.static(CONTACT):
-                        constraint.record_contacts(m, here, ck, touches)
+                        constraint.record_contacts(m, here, ck, contacts)
                 for i in range(1, here.n):
-                    motions[i].u = motions[i].rate
+                    motions[i].u = motions[i].accel_joint
                 if wp.static(not DAMPED):
-                    root.speeding_up = vec3()
-                    root.turning_up = vec3()
-                root.speeding_up = root.vdot + root.speeding_up
-                root.turning_up = root.wdot + root.turning_up
+                    root.vdot = vec3()
+                    root.wdot = vec3()
+                root.vdot = root.newton_vdot + root.vdot
+                root.wdot = root.newton_wdot + root.wdot
             else:
-                here.factor = here.row
-                here.keep = record
+                here.factor_row = here.row
+                here.store_factor = record
                 sweep.inward(m, here, SOLVE, ck, links, motions, loads)
                 root = sweep.accelerate(m, here, SOLVE, ck, links, motions, loads[0], root)
             # 3. the new state
             if record == 1:
-                record_rates(m, here, ck, 0, root.speeding_up, root.turning_up, motions)
-            root = integrate(m, here, links, motions, turn, root)
+                record_accelerations(m, here, ck, 0, root.vdot, root.wdot, motions)
+            root = integrate(m, here, links, motions, ball_rot, root)
 
-        # An environment that left the finite numbers, or any imaginable speed, is handed back as it came.
-        broken = broken_numbers(m, here, batch, links, turn, root)
-        block.write_flags(nonfinite, here.e, broken)
+        # An environment whose state is not finite or out of bounds gets back its state from before the step.
+        failed = count_nonfinite(m, here, batch, links, ball_rot, root)
+        block.write_flags(nonfinite, here.e, failed)
         if wp.static(CONSTRAINED):
-            residual = pick(T(0.0), broken, T(0.0), wp.sqrt(residual))
+            residual = pick(T(0.0), failed, T(0.0), wp.sqrt(residual))
             write(batch.qvel_out, here.e, NV, residual)
             if here.lane == 0:
                 block.count(unconverged, here.e, pick(T(tolerance), residual, T(1.0), T(0.0)))
-        write_state(m, here, broken, batch, links, turn, root)
+        write_state(m, here, failed, batch, links, ball_rot, root)
 
     return forward

@@ -1,4 +1,4 @@
-"""What the forward and the backward kernel share: where each link is, and how checkpoints are read and written."""
+"""Kinematics of the links, and access to checkpoints, for the forward and the backward kernel."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -47,57 +47,57 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
         return QADR + link_of(m, k)
 
     @wp.func
-    def quat_of(w: T, x: T, y: T, z: T):
-        """From MuJoCo's order of a quaternion to Warp's."""
+    def wxyz_to_quat(w: T, x: T, y: T, z: T):
+        """Convert a quaternion from MuJoCo's order to Warp's."""
         return quat(x, y, z, w)
 
     @wp.func
     def load_quat(a: t.array2, e: int, k: int):
-        return quat_of(read(a, e, k), read(a, e, k + 1), read(a, e, k + 2), read(a, e, k + 3))
+        return wxyz_to_quat(read(a, e, k), read(a, e, k + 1), read(a, e, k + 2), read(a, e, k + 3))
 
     @wp.func
     def load_quat_row(a: t.array3, row: int, k: int, e: int):
-        return quat_of(load(a, row, k, e), load(a, row, k + 1, e), load(a, row, k + 2, e), load(a, row, k + 3, e))
+        return wxyz_to_quat(load(a, row, k, e), load(a, row, k + 1, e), load(a, row, k + 2, e), load(a, row, k + 3, e))
 
     @wp.func
-    def place_balls(m: Model, here: Lane, turn: t.quats, links: t.Links):
-        """Into the first link's R the turn of each ball joint, and into q, for the spring, its rotation vector."""
+    def place_balls(m: Model, here: Lane, ball_rot: t.quats, links: t.Links):
+        """Write each ball joint's rotation into its first link's R, and its rotation vector, for springs, into q."""
         for b in range(m.ball_count[here.lane]):
             i = m.ball_slot[here.lane * NBALL + b]
-            links[i].R = wp.quat_to_matrix(turn[b])
+            links[i].R = wp.quat_to_matrix(ball_rot[b])
             if wp.static(STIFFNESS):
-                r = log_quat(turn[b])
+                r = log_quat(ball_rot[b])
                 for k in range(3):
                     links[i + k].q = r[k]
 
     @wp.func
-    def carrier_place(m: Model, x: T, z: T):
-        """Of a floating base at x and z, or at 0 and 0 of a fixed base, on which slides may carry it on."""
+    def carrier_position(m: Model, x: T, z: T):
+        """Return the position of a floating base at x and z, or of a fixed base (x = z = 0), to which slides add."""
         if wp.static(TERRAIN):
             return vec2(T(m.carrier_along) + x, T(m.carrier_height) + z)
         else:
             return T(m.carrier_height) + z
 
     @wp.func
-    def place_links(m: Model, here: Lane, links: t.Links, place: t.Place):
-        """Where each link is (about the carrier), its joint's axis and its velocity; returns the carrier's place.
+    def place_links(m: Model, here: Lane, links: t.Links, carrier: t.CarrierPos):
+        """Compute each link's pose about the carrier, joint axis and velocity; returns the carrier's position.
 
-        R of a ball joint's first link comes with the joint's own turn.
+        On entry R of a ball joint's first link is the joint's own rotation.
         """
         for i in range(1, here.n):
             k = here.at + i
             if wp.static(BALL):
-                turn = links[i].R
+                ball_rot = links[i].R
             p = m.parent[k]
             a = links[p].R * vec3(m.axis[k])
-            R_joint = mat3(m.turn0[k])
+            R_joint = mat3(m.rot0[k])
             if wp.static(HINGE):
                 if i > CARRIER:
-                    R_joint = R_joint + wp.sin(links[i].q) * mat3(m.turn1[k]) + wp.cos(links[i].q) * mat3(m.turn2[k])
+                    R_joint = R_joint + wp.sin(links[i].q) * mat3(m.rot1[k]) + wp.cos(links[i].q) * mat3(m.rot2[k])
             links[i].R = links[p].R * R_joint
             if wp.static(BALL):
                 if m.outboard[k] == i + 2:
-                    links[i].R = links[i].R * turn
+                    links[i].R = links[i].R * ball_rot
                     R = links[i].R
                     a = vec3(R[0, 0], R[1, 0], R[2, 0])
             xi = links[p].x + links[p].R * vec3(m.position[k])
@@ -107,16 +107,16 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                     xi = xi + a * links[i].q
                     Si = join(vec3(), a)
             if wp.static(CARRIER > 0):
-                # The massless slides up to the carrier move its origin: nothing reads where they are.
+                # The massless slides up to the carrier move its origin. Their own position is never read.
                 if i <= CARRIER:
                     xi = vec3()
                     if wp.static(TERRAIN):
-                        place = place + links[i].q * vec2(a[0], a[2])
+                        carrier = carrier + links[i].q * vec2(a[0], a[2])
                     else:
-                        place = place + a[2] * links[i].q
+                        carrier = carrier + a[2] * links[i].q
             links[i].x = xi
             links[i].S = Si
             links[i].V = links[p].V + Si * links[i].qd
-        return place
+        return carrier
 
     return functions(locals())

@@ -7,7 +7,7 @@ import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
-from diffsim.kernels.factors import MASS
+from diffsim.kernels.lane import MASS
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -18,27 +18,27 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, mat3, Model, Lane, Link = t.T, t.vec3, t.mat3, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
-    momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
+    momentum, CarrierPos, Load, VARIED = sp.momentum, t.CarrierPos, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
-    LIFT, DRAG, CONTACT = spec.has("gravcomp drag contact")
+    GRAVCOMP, DRAG, CONTACT = spec.has("gravcomp drag contact")
     CONTACT = CONTACT and not spec.constrained
 
     @wp.func
-    def mass_of(m: Model, k: int, link: Link):
-        """Centre of mass and inertia about it of link k."""
+    def world_inertia(m: Model, k: int, link: Link):
+        """Return link k's centre of mass and its inertia about that, in world axes."""
         return sp.on_link(link.R, link.x, m.com[k]), link.R * mat3(m.inertia[k]) * wp.transpose(link.R)
 
     @wp.func
-    def lift(m: Model, k: int, link: Link):
-        """Where gravity compensation acts on link k, its force and its wrench."""
+    def gravcomp_wrench(m: Model, k: int, link: Link):
+        """Return the point where gravity compensation acts on link k, its force and its wrench."""
         p = sp.on_link(link.R, link.x, m.lift_position[k])
         f = -T(m.lift[k]) * vec3(m.gravity)
         return p, f, sp.force_at(p, f)
 
     @wp.func
-    def link_inertia(m: Model, here: Lane, k: int, link: Link, place: Place):
-        """What link k alone weighs, contacts included."""
-        com, inertia = mass_of(m, k, link)
+    def link_inertia(m: Model, here: Lane, k: int, link: Link, carrier: CarrierPos):
+        """Compute the inertia and bias force of link k alone, soft contacts included."""
+        com, inertia = world_inertia(m, k, link)
         V = link.V
         mass = T(m.mass[k])
         if wp.static(VARIED):
@@ -49,24 +49,24 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         load.a = inertia - load.b * wp.skew(com)
         load.d = wp.diag(vec3(mass, mass, mass))
         load.f = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
-        if wp.static(LIFT):
-            _p, _f, up = lift(m, k, link)
+        if wp.static(GRAVCOMP):
+            _p, _f, up = gravcomp_wrench(m, k, link)
             if wp.static(VARIED):
                 up = here.mass * up
             load.f = load.f - up
         if wp.static(DRAG):
             load.f = load.f - drag.drag_wrench(m, k, link.R, com, V)
         if wp.static(CONTACT):
-            load = contact.add_contacts(m, here, k, link, place, load)
+            load = contact.add_contacts(m, here, k, link, carrier, load)
         return load
 
     @wp.func
-    def link_adjoint(m: Model, here: Lane, k: int, link: Link, node: Node, place: Place, adj_factors: Array):
-        """The adjoints of one link's part of phi, all about the carrier's position.
+    def link_adjoint(m: Model, here: Lane, k: int, link: Link, node: Node, carrier: CarrierPos, adj_factors: Array):
+        """Compute the adjoints of link k's part of phi, about the carrier's position.
 
-        adj_factors, here and in all laws, are written if varied only.
+        adj_factors, here and in all laws, are written only if the spec is varied.
         """
-        com, inertia = mass_of(m, k, link)
+        com, inertia = world_inertia(m, k, link)
         V = link.V
         W = node.W
         Iv = momentum(T(m.mass[k]), com, inertia, V)
@@ -75,29 +75,29 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         adj.w = momentum(T(m.mass[k]), com, inertia, node.A) + wp.spatial_cross_dual(V, Iv)
         adj.v = momentum(T(m.mass[k]), com, inertia, wp.spatial_cross(W, V))
         adj.v = adj.v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj.a)
-        if wp.static(LIFT):  # as an external force, see force.py
-            p, f, up = lift(m, k, link)
+        if wp.static(GRAVCOMP):  # as an external force, see force.py
+            p, f, up = gravcomp_wrench(m, k, link)
             adj.w = adj.w - up
             adj.p = -sp.force_at(p, wp.cross(f, wp.spatial_top(W))) - wp.spatial_cross_dual(W, up)
         if wp.static(VARIED):
-            # phi's inertial part is W . adj_w, and all of this is that of a factor of one.
+            # phi's inertial part is W . adj_w. All of the above is for a factor of 1.
             adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj.w)
             adj.a = here.mass * adj.a
             adj.w = here.mass * adj.w
             adj.v = here.mass * adj.v
-            if wp.static(LIFT):
+            if wp.static(GRAVCOMP):
                 adj.p = here.mass * adj.p
         if wp.static(DRAG):
             adj.w = adj.w - drag.drag_wrench(m, k, link.R, com, V)
             adj.v = adj.v + drag.drag_adjoint(m, k, link.R, com, V, W)
         if wp.static(CONTACT):
-            adj = contact.add_contacts_adjoint(m, here, k, link, node, place, adj, adj_factors)
+            adj = contact.add_contacts_adjoint(m, here, k, link, node, carrier, adj, adj_factors)
         return adj
 
     @wp.func
     def add_damping_adjoint(m: Model, here: Lane, k: int, link: Link, node: t.Node, adj: Adjoint, adj_factors: t.Ts):
-        """With the adjoints of D and W1 in phi's part W1 . I D, where damping follows the constraints."""
-        com, inertia = mass_of(m, k, link)
+        """Add the adjoints of D and W1 in phi's part W1 . I D, where damping follows the constraints."""
+        com, inertia = world_inertia(m, k, link)
         adj.d = momentum(T(m.mass[k]), com, inertia, node.W1)
         adj.w1 = momentum(T(m.mass[k]), com, inertia, node.D)
         if wp.static(VARIED):
@@ -107,7 +107,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         return adj
 
     @wp.func
-    def plus(x: Adjoint, y: Adjoint):
+    def add_adjoints(x: Adjoint, y: Adjoint):
         x.a = x.a + y.a
         x.v = x.v + y.v
         x.w = x.w + y.w

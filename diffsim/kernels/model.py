@@ -1,4 +1,4 @@
-"""The numbers of a scene as the kernels read them: Warp's types, and a struct of arrays on a device."""
+"""Model: a scene's numbers as the kernels read them, and the structs in which the kernels keep theirs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, cached_property
@@ -13,40 +13,42 @@ from diffsim.kernels.spec import KernelSpec
 from diffsim.robot.scene import Scene
 
 
-class _Numbers:
-    """What fields of a Model are made of. Of each lane's links there is a row of `slots` entries, the last ones unused
-    where a lane has fewer."""
+class _Entries:
+    """Arranges a scene's arrays by entry, the order in which the lanes read them.
+
+    Each lane has a row of `slots` entries, one per link. The last ones are unused where a lane has fewer links.
+    """
 
     def __init__(self, scene: Scene, division: Division) -> None:
         self.scene, self.division = scene, division
         threads, slots = division.threads_per_env, division.slots
-        self.link = padded(division.links, slots)  # of each entry, and
-        self.lane = np.repeat(np.arange(threads), slots)
-        self.slot = np.zeros((threads, scene.nlink), np.int32)  # of each lane's each link
+        self.link = padded(division.links, slots)  # (entries,)
+        self.lane = np.repeat(np.arange(threads), slots)  # (entries,)
+        self.slot = np.zeros((threads, scene.nlink), np.int32)  # where a lane has a link
         for lane, row in enumerate(division.links):
             self.slot[lane, row] = np.arange(len(row))
-        weighs = division.weighs
-        self.carried = np.array([i in weighs[lane] for lane, i in zip(self.lane, self.link, strict=True)], float)
+        masses = division.masses
+        self.owned = np.array([i in masses[lane] for lane, i in zip(self.lane, self.link, strict=True)], float)
         self.axis = np.einsum("nij,nj->ni", scene.rotation, scene.axis)
         self.position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * self.axis
         self.balls = [np.flatnonzero(scene.ball[row] == 0).tolist() for row in division.links]
 
-    def slots_of(self, links: np.ndarray) -> np.ndarray:
-        """Of what each link points to, where the entry's lane has it."""
+    def to_slots(self, links: np.ndarray) -> np.ndarray:
+        """Return for each entry the slot of the link that its own link points to, in its lane."""
         return self.slot[self.lane, links[self.link]]
 
-    def around_ball(self, k: int) -> np.ndarray:
-        """The k-th link of the ball joint that each link belongs to, or the link itself."""
+    def ball_link(self, k: int) -> np.ndarray:
+        """Return the k-th link of the ball joint that each link belongs to, or the link itself."""
         return np.arange(self.scene.nlink) + np.where(self.scene.ball < 0, 0, k - self.scene.ball)
 
-    def carry(self, values: np.ndarray) -> np.ndarray:
-        """By entry, but zero on lanes that do not carry the link's mass."""
+    def masked(self, values: np.ndarray) -> np.ndarray:
+        """Return the links' values by entry, zero on lanes that do not own the link's mass."""
         values = values[self.link]
-        return values * self.carried.reshape(-1, *[1] * (values.ndim - 1))
+        return values * self.owned.reshape(-1, *[1] * (values.ndim - 1))
 
     @cached_property
-    def turns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rodrigues for the angle q - ref, expanded by the sum formulas: the kernels then need no reference."""
+    def joint_rotations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Expand Rodrigues' formula for the angle q - ref by the sum formulas, so that kernels need no reference."""
         s = self.scene
         skew = np.cross(np.eye(3)[None], s.axis[:, None])  # skew(a) b = a x b
         hinge = np.where(s.slide | (s.ball >= 0), 0.0, 1.0)[:, None, None]
@@ -65,13 +67,17 @@ class _Numbers:
     @cached_property
     def motor_lane(self) -> np.ndarray:
         lane = (self.motor_slot > 0).argmax(0)
-        for k, hand in enumerate(self.division.muscles):
-            lane[hand] = k
+        for k, share in enumerate(self.division.muscles):
+            lane[share] = k
         return lane
 
     @cached_property
     def segments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Their order, by lane and then by the pair of links that they join; the pairs (lane, i, j), their starts."""
+        """Sort segments by lane, then by the pair of links that they join.
+
+        Returns:
+            their order; the pairs (lane, i, j); where each pair's segments begin.
+        """
         key = np.column_stack([self.motor_lane[self.scene.segment_muscle], self.scene.segment_link])
         order = np.lexsort(key.T[::-1])
         pairs, start = np.unique(key[order], axis=0, return_index=True)
@@ -79,21 +85,20 @@ class _Numbers:
 
     @cached_property
     def spheres(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.by_entry(self.division.spheres, self.scene.contact_link)
+        return self.group_by_entry(self.division.spheres, self.scene.contact_link)
 
     @cached_property
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """A body is on the lane that carries its link's mass."""
+        """Assign each body to the lane that owns its link's mass."""
         link = self.scene.body_link
-        return self.by_entry([np.flatnonzero(np.isin(link, row)) for row in self.division.weighs], link)
+        return self.group_by_entry([np.flatnonzero(np.isin(link, row)) for row in self.division.masses], link)
 
-    def by_entry(self, hands: Sequence[Iterable[int]], link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where each entry begins, and the things themselves, of things on links that are dealt to the lanes."""
-        rows = [
-            (lane * self.division.slots + self.slot[lane, link[k]], k) for lane, hand in enumerate(hands) for k in hand
-        ]
-        entry, things = np.array(sorted(rows), int).reshape(-1, 2).T
-        return np.searchsorted(entry, np.arange(len(self.link) + 1)), things
+    def group_by_entry(self, shares: Sequence[Iterable[int]], link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sort the elements that each lane has on its links; returns where each entry's begin, and the elements."""
+        slots = self.division.slots
+        rows = [(lane * slots + self.slot[lane, link[k]], k) for lane, share in enumerate(shares) for k in share]
+        entry, elements = np.array(sorted(rows), int).reshape(-1, 2).T
+        return np.searchsorted(entry, np.arange(len(self.link) + 1)), elements
 
     @cached_property
     def terrain(self) -> np.ndarray:
@@ -103,103 +108,106 @@ class _Numbers:
         return np.concatenate([vertices, along], 2)
 
 
-Field = tuple[str, Callable[[_Numbers], Any]]
+Field = tuple[str, Callable[[_Entries], Any]]
 
 
 def _links(kind: str, names: str) -> dict[str, Field]:
-    """Fields that are the scene's, of each entry's link."""
+    """Read the scene's fields at each entry's link."""
     return {name: (kind, lambda n, name=name: getattr(n.scene, name)[n.link]) for name in names.split()}
 
 
-def _carried(kind: str, names: str) -> dict[str, Field]:
-    """The same, but zero on the lanes that do not carry the link's mass."""
-    return {name: (kind, lambda n, name=name: n.carry(getattr(n.scene, name))) for name in names.split()}
+def _owned(kind: str, names: str) -> dict[str, Field]:
+    """Read the same, but zero on lanes that do not own the link's mass."""
+    return {name: (kind, lambda n, name=name: n.masked(getattr(n.scene, name))) for name in names.split()}
 
 
 def _scenes(kind: str, names: str) -> dict[str, Field]:
-    """Fields that are the scene's."""
+    """Read the scene's fields as they are."""
     return {name: (kind, lambda n, name=name: getattr(n.scene, name)) for name in names.split()}
 
 
-# The name of each field, its type (an array's ends in s, or ss with two dimensions), and where its numbers come from;
-# one whose source is None stays empty. Of each lane's each link there is entry lane * slots + slot.
+# Each field of Model: its name, its type (an array's ends in s, or ss with two dimensions), and its source; one whose
+# source returns None stays empty. Arrays of links have the entry lane * slots + slot for each link of each lane.
 FIELDS: dict[str, Field] = {
-    "count": ("ints", lambda n: [len(row) for row in n.division.links]),  # links of each lane
-    "link": ("ints", lambda n: n.link),  # its number in the scene, which says where its joint is in qvel
-    "parent": ("ints", lambda n: n.slots_of(n.scene.parent)),  # a slot, as are inboard and outboard
-    **_links("ints", "slide"),
-    # R = R_parent (turn0 + sin q turn1 + cos q turn2); axis and position in the parent's frame
-    "turn0": ("mat3s", lambda n: n.turns[0]),
-    "turn1": ("mat3s", lambda n: n.turns[1]),
-    "turn2": ("mat3s", lambda n: n.turns[2]),
-    "position": ("vec3s", lambda n: n.position[n.link]),
-    "axis": ("vec3s", lambda n: n.axis[n.link]),
-    # read in scenes with ball joints only: the first link of each ball joint; of each link its place in qpos, the
-    # link that its joint hangs on, and the link that its joint turns
-    "ball_count": ("ints", lambda n: [len(row) for row in n.balls]),
-    "ball_slot": ("ints", lambda n: padded(n.balls, n.scene.nball)),
-    **_links("ints", "qpos_adr"),
-    "inboard": ("ints", lambda n: n.slots_of(n.scene.parent[n.around_ball(0)])),
-    "outboard": ("ints", lambda n: n.slots_of(n.around_ball(2))),
-    "carried": ("ints", lambda n: n.carried),  # 1 on the one lane that has its mass
-    **_carried("reals", "mass lift"),  # lift: read with gravity compensation only
-    **_carried("mat3s", "inertia"),
-    **_links("vec3s", "com lift_position"),
-    **_links("reals", "armature damping stiffness spring_ref lower upper k_limit d_limit"),
-    **_links(
-        "reals", "servo_stiffness servo_damping servo_ref force_low force_high"
-    ),  # read where actuators have bounds
-    "motor_slot": ("ints", lambda n: n.motor_slot.flatten()),  # of each lane's each motor, 0 if another has its link
-    "motor_lane": ("ints", lambda n: n.motor_lane),  # the lane that writes its gradient
-    **_scenes("reals", "gear motor_bias"),
-    # segments of muscles, from a in the frame of pair_link[2 k] to b in that of pair_link[2 k + 1];
-    # a lane's muscles are muscle[muscle_begin[lane]] .. muscle[muscle_begin[lane + 1] - 1]
-    "muscle_begin": ("ints", lambda n: np.cumsum([0, *map(len, n.division.muscles)])),
-    "muscle": ("ints", lambda n: sum(n.division.muscles, [])),
-    # its pairs of links are lane_begin[lane] .. lane_begin[lane + 1], the segments of pair k are pair_begin[k] ..
-    "lane_begin": ("ints", lambda n: np.searchsorted(n.segments[1][:, 0], np.arange(len(n.division.muscles) + 1))),
-    "pair_link": ("ints", lambda n: n.slot[n.segments[1][:, :1], n.segments[1][:, 1:]].flatten()),
-    "pair_begin": ("ints", lambda n: n.segments[2]),
-    "segment_a": ("vec3s", lambda n: n.scene.segment_position[n.segments[0], 0]),
-    "segment_b": ("vec3s", lambda n: n.scene.segment_position[n.segments[0], 1]),
-    "segment_muscle": ("ints", lambda n: n.scene.segment_muscle[n.segments[0]]),
-    "contact_begin": (
+    "count": ("ints", lambda n: [len(row) for row in n.division.links]),  # number of links of each lane
+    "link": ("ints", lambda n: n.link),  # the link's number in the scene, from which its joint's place in qvel follows
+    "parent": ("ints", lambda n: n.to_slots(n.scene.parent)),  # slot of the parent
+    **_links("ints", "slide"),  # 1 of a slide joint
+    # The frame: R = R_parent (rot0 + sin q rot1 + cos q rot2)
+    "rot0": ("mat3s", lambda n: n.joint_rotations[0]),  # the constant part
+    "rot1": ("mat3s", lambda n: n.joint_rotations[1]),  # times sin q
+    "rot2": ("mat3s", lambda n: n.joint_rotations[2]),  # times cos q
+    "position": ("vec3s", lambda n: n.position[n.link]),  # m, in the parent's frame
+    "axis": ("vec3s", lambda n: n.axis[n.link]),  # unit joint axis in the parent's frame
+    # Ball joints, read only in scenes that have some
+    "ball_count": ("ints", lambda n: [len(row) for row in n.balls]),  # number of ball joints of each lane
+    "ball_slot": ("ints", lambda n: padded(n.balls, n.scene.nball)),  # slot of each one's first link
+    **_links("ints", "qpos_adr"),  # the joint's place in qpos
+    "inboard": ("ints", lambda n: n.to_slots(n.scene.parent[n.ball_link(0)])),  # slot of the link that holds the joint
+    "outboard": ("ints", lambda n: n.to_slots(n.ball_link(2))),  # slot of the link that the joint turns
+    # Inertia and the joints' laws
+    "owned": ("ints", lambda n: n.owned),  # 1 on the one lane that has the link's mass
+    **_owned("reals", "mass"),  # kg
+    **_owned("mat3s", "inertia"),  # kg m^2, about the centre of mass
+    **_links("vec3s", "com"),  # m, centre of mass in the link's frame
+    **_owned("reals", "lift"),  # kg, gravity compensation, and
+    **_links("vec3s", "lift_position"),  # m, where it acts
+    **_links("reals", "armature damping stiffness spring_ref"),  # MuJoCo's
+    **_links("reals", "lower upper k_limit d_limit"),  # the joint's range, and the law of its limits
+    **_links("reals", "servo_stiffness servo_damping servo_ref force_low force_high"),  # of actuators with a forcerange
+    "motor_slot": ("ints", lambda n: n.motor_slot.flatten()),  # (lane, motor), 0 if the motor's link is on another lane
+    "motor_lane": ("ints", lambda n: n.motor_lane),  # the lane that writes the motor's gradient
+    **_scenes("reals", "gear motor_bias"),  # force of an actuator: gear ctrl + motor_bias
+    # Muscles: a segment runs from point a of link pair_link[2 k] to point b of link pair_link[2 k + 1]
+    "muscle_begin": ("ints", lambda n: np.cumsum([0, *map(len, n.division.muscles)])),  # of each lane, in muscle
+    "muscle": ("ints", lambda n: sum(n.division.muscles, [])),  # actuators that are muscles, by lane
+    "lane_begin": (  # of each lane, in the pairs of links
         "ints",
-        lambda n: n.spheres[0],
-    ),  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
-    "contact_position": ("vec3s", lambda n: n.scene.contact_position[n.spheres[1]]),
-    "contact_radius": ("reals", lambda n: n.scene.contact_radius[n.spheres[1]]),
-    # MuJoCo's constraints, read by the integrator mujoco only: robot/constraint.py has their order
-    "contact_numbers": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.contact[n.spheres[1]]),
-    "limit_numbers": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.limit[n.link]),
+        lambda n: np.searchsorted(n.segments[1][:, 0], np.arange(len(n.division.muscles) + 1)),
+    ),
+    "pair_link": ("ints", lambda n: n.slot[n.segments[1][:, :1], n.segments[1][:, 1:]].flatten()),  # slots i, j of each
+    "pair_begin": ("ints", lambda n: n.segments[2]),  # of each pair, in the segments
+    "segment_a": ("vec3s", lambda n: n.scene.segment_position[n.segments[0], 0]),  # m, in the frame of link i
+    "segment_b": ("vec3s", lambda n: n.scene.segment_position[n.segments[0], 1]),  # m, in the frame of link j
+    "segment_muscle": ("ints", lambda n: n.scene.segment_muscle[n.segments[0]]),  # the actuator that pulls
+    # Contact spheres
+    "contact_begin": ("ints", lambda n: n.spheres[0]),  # of each entry, in the spheres
+    "contact_position": ("vec3s", lambda n: n.scene.contact_position[n.spheres[1]]),  # m, centre in the link's frame
+    "contact_radius": ("reals", lambda n: n.scene.contact_radius[n.spheres[1]]),  # m
+    # MuJoCo's constraints: rows of robot.scene.Constraints
+    "contact_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.contact[n.spheres[1]]),
+    "limit_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.limit[n.link]),
     "joint_loss": ("vec3s", lambda n: n.scene.constraints and n.scene.constraints.loss[n.link]),
-    "body_begin": ("ints", lambda n: n.bodies[0]),  # bodies of entry k are body_begin[k] .. body_begin[k + 1]
-    "body": ("ints", lambda n: n.bodies[1]),
-    "body_com": ("vec3s", lambda n: n.scene.body_com[n.bodies[1]]),
-    "drag_frame": ("mat3s", lambda n: n.scene.drag[0][n.link]),  # principal axes in the link's frame, see drag.py
-    "drag_viscous": ("vec3s", lambda n: n.carry(n.scene.drag[1])),  # (a, c, 0)
-    "drag_force": ("vec3s", lambda n: n.carry(n.scene.drag[2])),
-    "drag_torque": ("vec3s", lambda n: n.carry(n.scene.drag[3])),
-    # read in scenes with a terrain only: a row of each profile, or one for all environments, whose vertices are
-    # (x, z, unit vector along the segment that begins there)
-    "terrain": ("vec4ss", lambda n: n.terrain),
-    "carrier_along": ("real", lambda n: n.scene.root[0][0]),  # x at q = 0
-    # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
-    "carrier_height": ("real", lambda n: n.scene.root[0][2] - n.scene.ground_height),
-    "base_damping": ("real", lambda n: n.scene.base_damping[0]),
-    **_scenes("vec3", "gravity"),
-    **_scenes("real", "k_n k_d k_t mu"),
+    # Bodies of the MJCF, for external forces
+    "body_begin": ("ints", lambda n: n.bodies[0]),  # of each entry, in body
+    "body": ("ints", lambda n: n.bodies[1]),  # MuJoCo's number of the body
+    "body_com": ("vec3s", lambda n: n.scene.body_com[n.bodies[1]]),  # m, in the link's frame
+    # Drag, see drag.py
+    "drag_frame": ("mat3s", lambda n: n.scene.drag[0][n.link]),  # principal axes in the link's frame
+    "drag_viscous": ("vec3s", lambda n: n.masked(n.scene.drag[1])),  # (a, c, 0)
+    "drag_force": ("vec3s", lambda n: n.masked(n.scene.drag[2])),  # b of each axis
+    "drag_torque": ("vec3s", lambda n: n.masked(n.scene.drag[3])),  # d of each axis
+    # The ground and the world
+    "terrain": ("vec4ss", lambda n: n.terrain),  # (profile, vertex): x, z, unit vector to the next vertex
+    "carrier_along": ("real", lambda n: n.scene.root.position[0]),  # m, the carrier's x at q = 0
+    "carrier_height": (  # m, its height above the plane at q = 0
+        "real",
+        lambda n: n.scene.root.position[2] - n.scene.ground_height,
+    ),
+    "base_damping": ("real", lambda n: n.scene.base_damping[0]),  # of a floating base
+    **_scenes("vec3", "gravity"),  # m/s^2
+    **_scenes("real", "k_n k_d k_t mu"),  # soft contact, see contact.py
 }
 
 
 def struct(name: str, fields: dict[str, Any]) -> Any:
-    """A Warp struct that has fields of these types."""
+    """Make a Warp struct that has fields of these types."""
     return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__, "__qualname__": name}))
 
 
 @cache
 def scene_types(dtype: type) -> SimpleNamespace:
-    """Warp's vector types of a scene's numbers, and their struct."""
+    """Make Warp's vector types of a scene's numbers, and the struct Model of them."""
     kinds: dict[str, Any] = {f"vec{n}": wp.types.vector(n, dtype) for n in (3, 4, 11)}
     kinds |= {"real": dtype, "int": wp.int32, "mat3": wp.types.matrix((3, 3), dtype)}
     arrays = {f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()}
@@ -211,7 +219,7 @@ def scene_types(dtype: type) -> SimpleNamespace:
 
 @cache
 def types(spec: KernelSpec) -> SimpleNamespace:
-    """Warp's types in a kernel: U of a scene's numbers, T of those that environments have of their own (wide.py).
+    """Make Warp's types in a kernel: U of a scene's numbers, T of those that differ between environments (wide.py).
 
     An array of a struct has the struct's name and an s.
     """
@@ -221,61 +229,164 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     mat3, mat6, quat = wp.types.matrix((3, 3), T), wp.types.matrix((6, 6), T), wp.types.quaternion(T)
 
     kinds = {"T": T, "vec3": vec3, "vec6": vec6, "mat3": mat3, "quat": quat}
-
-    def of(**rows: str) -> dict[str, Any]:
-        return {name: kinds[kind] for kind, names in rows.items() for name in names.split()}
-
     array2, array3 = wp.array2d(dtype=U), wp.array3d(dtype=T)  # array2: a row for each environment
     structs: dict[str, dict[str, Any]] = {
-        # what a step takes and gives, or its gradients; forces and factors have no columns unless they vary
-        "Batch": dict.fromkeys("qpos qvel ctrl factors forces qpos_out qvel_out".split(), array2),
-        # what backward needs of each substep: qpos, qvel, qacc and the factor of the mass matrix
-        "Checkpoint": dict.fromkeys("qvaf", array3),
-        # a lane of an environment, or of a block of them, e; its n links are entries at, at + 1, ... of Model's arrays;
-        # rows of checkpoints: the substep's, and the factor's, which is kept if keep is 1; h: s, of a substep;
-        # constants of the laws, or factors of those that each link has its own of (k_limit to motor, read where they
-        # vary)
-        "Lane": dict.fromkeys("e lane at n row factor keep".split(), int)
-        | of(T="h k_n k_d k_t mu k_limit d_limit mass motor"),
-        # where a link is (about the carrier, in world axes), its joint's axis, its velocity, and its joint's state
-        "Link": of(mat3="R", vec3="x", vec6="S V", T="q qd"),
-        # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force
-        "Load": of(mat3="a b d", vec6="f"),
-        # what backward keeps of a link and its joint: the link's acceleration A and twist W under lambda; the gradients
-        # of the joint's position, rate and force; right-hand side, intermediate and solution of the solve; the motors'
-        # force, and 1 where it is within its bounds; with constraints the twist B of constraint.py and the acceleration
-        # before damping, which adds D to B and has a twist W1 of its own
-        "Node": of(vec6="A W", T="gq gqd gtau g u lam"),
-        # the adjoints of a link's acceleration, velocity, W and pose, of B, D and W1
-        "Adjoint": of(vec6="a v w p"),
-        # gradients of a floating base's position, turn and velocities, its linear velocity and acceleration
-        "Base": of(vec3="gp gr gv gw v vdot"),
-        # what the forward kernel keeps of a link and its joint: the link's velocity product C and acceleration A, with
-        # constraints that of a step; the factor U and 1/d, the right-hand side u and then the acceleration, the motors'
-        # force, what rounding the position lost. In Newton's method the link's acceleration so far (iterate), the
-        # joint's (rate), the force on it without constraints, theirs (held; firm: minus its slope), theirs where a part
-        # of the step is tried (holds; given: the slope's share), and the limit's stop
-        "Motion": of(vec6="C A U", T="dinv u motor rest"),
-        # a floating base's state, accelerations or steps of a solve, and the iterate
-        "Root": of(vec3="pos", quat="rot") | of(vec3="v w rest speeding_up turning_up vdot wdot"),
-        # where Newton's method is: 1 for environments that have not converged, else 0; squares of the residual and of
-        # the acceleration (plus 1); passes so far
-        "Newton": of(T="tolerance going off size") | {"passes": int},
-        # where a contact is, jar and force of the iterate and where a part of the step is tried, H step, the cone's H
-        # there, D, and whether it touches
-        "Contact": of(vec3="p jar f tried pushes Hs", mat3="H", T="D on"),
+        # State and controls of a control step, or their gradients
+        "Batch": {
+            "qpos": array2,  # before the step
+            "qvel": array2,  # before the step
+            "ctrl": array2,  # in [-1, 1] over the control range
+            "factors": array2,  # columns of FACTORS; no column unless the spec is varied
+            "forces": array2,  # xfrc_applied, six columns per body; no column unless the spec is forced
+            "qpos_out": array2,  # after the step
+            "qvel_out": array2,  # after the step, and with constraints the residual of Newton's method
+        },
+        # What the backward pass needs of each substep
+        "Checkpoint": {
+            "q": array3,  # qpos
+            "v": array3,  # qvel
+            "a": array3,  # qacc; with constraints also qacc before damping, and jar of each contact
+            "f": array3,  # factor of the mass matrix: U and 1/d of each joint, the base's Cholesky factor
+        },
+        # What one thread computes
+        "Lane": {
+            "e": int,  # the environment, or the block of environments
+            "lane": int,  # the lane's number in its environment
+            "at": int,  # entry of the lane's first link in Model's arrays
+            "n": int,  # number of links, at the entries at .. at + n - 1
+            "row": int,  # the substep's row of the checkpoint
+            "factor_row": int,  # row of the factor in the checkpoint
+            "store_factor": int,  # 1 if the sweep writes the factor
+            "h": T,  # s, length of a substep
+            # Constants of soft contact; with constraints, factors of stiffness, of D and of friction
+            "k_n": T,
+            "k_d": T,
+            "k_t": T,
+            "mu": T,
+            # Factors of constants that each link has of its own, read if varied
+            "k_limit": T,
+            "d_limit": T,
+            "mass": T,
+            "motor": T,
+        },
+        # Kinematics of a link, about the carrier in world axes, and its joint's state
+        "Link": {
+            "R": mat3,  # orientation
+            "x": vec3,  # m, origin
+            "S": vec6,  # the joint's motion subspace (axis)
+            "V": vec6,  # spatial velocity
+            "q": T,  # the joint's qpos
+            "qd": T,  # the joint's qvel
+        },
+        # Articulated-body inertia [[a, b], [b', d]] and bias force of a link and its subtree
+        "Load": {
+            "a": mat3,  # rotational block
+            "b": mat3,  # coupling block
+            "d": mat3,  # translational block
+            "f": vec6,  # bias force
+        },
+        # Backward pass: a link and its joint
+        "Node": {
+            "A": vec6,  # acceleration of the link minus gravity
+            "W": vec6,  # twist of the link under lambda
+            "gq": T,  # gradient of the joint's position
+            "gqd": T,  # gradient of the joint's velocity
+            "gtau": T,  # gradient of the joint's actuator force
+            "g": T,  # right-hand side of the solve
+            "u": T,  # intermediate of the solve
+            "lam": T,  # its solution lambda
+        },
+        # Backward pass: derivatives of phi with respect to quantities of a link
+        "Adjoint": {
+            "a": vec6,  # acceleration
+            "v": vec6,  # velocity
+            "w": vec6,  # W
+            "p": vec6,  # pose, as a wrench
+        },
+        # Backward pass: a floating base
+        "Base": {
+            "gp": vec3,  # gradient of the position
+            "gr": vec3,  # gradient of the orientation, in the body's tangent space
+            "gv": vec3,  # gradient of the linear velocity
+            "gw": vec3,  # gradient of the angular velocity
+            "v": vec3,  # linear velocity
+            "vdot": vec3,  # linear acceleration minus gravity
+        },
+        # Forward pass: a link and its joint
+        "Motion": {
+            "C": vec6,  # velocity product of the link
+            "A": vec6,  # acceleration of the link; in Newton's method the step's
+            "U": vec6,  # articulated inertia times S
+            "dinv": T,  # 1 / (S . U + armature + implicit terms)
+            "u": T,  # the joint's force minus bias, then its acceleration; in Newton's method the step's
+            "motor": T,  # force of the joint's motors
+            "rounding_error": T,  # what rounding took from the joint's position so far
+        },
+        # Forward pass: a floating base
+        "Root": {
+            "pos": vec3,  # m
+            "rot": quat,  # orientation
+            "v": vec3,  # linear velocity, world axes
+            "w": vec3,  # angular velocity, body axes
+            "rounding_error": vec3,  # what rounding took from pos so far
+            "vdot": vec3,  # linear acceleration; in Newton's method the step's
+            "wdot": vec3,  # angular acceleration; in Newton's method the step's
+            "newton_vdot": vec3,  # linear acceleration of Newton's iterate
+            "newton_wdot": vec3,  # angular acceleration of Newton's iterate
+        },
+        # Newton's method of an environment
+        "Newton": {
+            "tolerance": T,  # of the residual
+            "active": T,  # 1 until the environment has converged, then 0
+            "residual_sq": T,  # square of the residual
+            "accel_sq": T,  # 1 plus the square of the acceleration
+            "passes": int,  # so far
+        },
+        # A contact with MuJoCo's law
+        "Contact": {
+            "p": vec3,  # the contact point, about the carrier
+            "jar": vec3,  # J a - aref of the iterate
+            "f": vec3,  # force of the iterate
+            "trial_jar": vec3,  # jar after the trial step
+            "trial_force": vec3,  # force after the trial step
+            "Hs": vec3,  # H of the iterate times the step
+            "H": mat3,  # minus the force's derivatives in jar, of the last trial step
+            "D": T,  # inverse of the regularised inertia
+            "active": T,  # 1 within the margin
+        },
     }
     if "clamp" in spec.features:
-        structs["Node"] |= of(T="motor free")
+        structs["Node"] |= {
+            "motor": T,  # force of the joint's motors
+            "unclamped": T,  # 1 where the actuators' force is within its bounds
+        }
     if spec.constrained:
-        structs["Node"] |= of(vec6="B", T="rate")
-        structs["Adjoint"] |= of(vec6="b")
-        structs["Motion"] |= of(vec6="iterate", vec3="stop", T="rate force held firm holds given")
+        structs["Node"] |= {
+            "B": vec6,  # sum of S qacc, the twist that gives J a (constraint.py)
+            "qacc": T,  # the joint's acceleration before damping
+        }
+        structs["Adjoint"] |= {"b": vec6}  # B
+        structs["Motion"] |= {
+            "accel_link": vec6,  # acceleration of the link, of Newton's iterate
+            "limit": vec3,  # the limit's row, see constraint.limit_state
+            "accel_joint": T,  # acceleration of the joint, of Newton's iterate
+            "free_force": T,  # force of the joint without constraints
+            "con_force": T,  # force of its constraints
+            "con_slope": T,  # minus the derivative of con_force
+            "trial_force": T,  # con_force after the trial step
+            "trial_slope": T,  # con_slope after the trial step
+        }
     if spec.damped:
-        structs["Node"] |= of(vec6="D W1")
-        structs["Adjoint"] |= of(vec6="d w1")
+        structs["Node"] |= {
+            "D": vec6,  # what damping adds to B
+            "W1": vec6,  # twist under lambda of the damped solve
+        }
+        structs["Adjoint"] |= {
+            "d": vec6,  # D
+            "w1": vec6,  # W1
+        }
     if "terrain" in spec.features:
-        structs["Contact"] |= of(mat3="E")  # the frame in which jar, forces and H are
+        structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
     kinds |= {name: struct(name, members) for name, members in structs.items()}
     return SimpleNamespace(
         **kinds,
@@ -283,22 +394,22 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         **{"U": U, "vec2": vec2, "vec4": vec4, "mat6": mat6, "array2": array2, "array3": array3},
         scene=scene_types(U),
         Model=scene_types(U).Model,
-        Place=vec2 if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
+        CarrierPos=vec2 if "terrain" in spec.features else T,  # the carrier's (x, z), or its height
         Frame=mat3 if "terrain" in spec.features else T,  # of a contact: E of terrain.py, or the world's, of which is 1
     )
 
 
 def functions(names: dict[str, Any]) -> SimpleNamespace:
-    """What a module of the kernels offers to others: Warp's functions among its names."""
+    """Select Warp's functions among a module's names: what it offers to other modules."""
     return SimpleNamespace(**{name: value for name, value in names.items() if isinstance(value, wp.Function)})
 
 
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
-    """The scene's numbers as a Warp struct on a device."""
-    Model, numbers = scene_types(dtype).Model, _Numbers(scene, division)
+    """Put the scene's numbers into a Model on a device."""
+    Model, entries = scene_types(dtype).Model, _Entries(scene, division)
     model = Model()
     for name, (_, source) in FIELDS.items():
-        kind, values = Model.vars[name].type, source(numbers)
+        kind, values = Model.vars[name].type, source(entries)
         if isinstance(kind, wp.array) and values is not None:
             values = np.ascontiguousarray(values, np.int32 if kind.dtype is wp.int32 else float)
             # Warp gives an empty array no address; one unread element keeps the struct uniform.
@@ -310,5 +421,5 @@ def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
 
 
 def padded(rows: list[list[int]], width: int) -> np.ndarray:
-    """The rows end to end, each filled up with zeros."""
+    """Join the rows end to end, each filled up with zeros to the width."""
     return np.array([[*row, *[0] * (width - len(row))] for row in rows], np.int32).flatten()

@@ -1,14 +1,14 @@
-"""Newton's method on MuJoCo's constraints: where its iterates are, whether they have converged, how far a step goes.
+"""Newton's method on MuJoCo's constraints: its iterate, its residual and its line search.
 
-A pass of the articulated-body algorithm takes the constraints' forces for linear in the acceleration: after the step s
-they are f - H s. Where they are that, the acceleration is the solution. `measure` finds by how much they differ, as
-accelerations: over the inverse of the inverse weight and the slope, as the next step would.
+A pass of the articulated-body algorithm linearises the constraints' forces about the iterate: after the step s they are
+f - H s. The iterate is the solution if the true forces f(s) equal that. `evaluate_trial` returns the difference as an
+acceleration, the one by which the next step would correct it: (1 / w + H)^-1 (f - H s - f(s)), w the inverse weight.
 
-A pass solves for the step, not for its end: on stiff ground a sum of accelerations has lost in float32 what the force
-depends on. What a force depends on, and the links' accelerations, add up steps, which become small.
+A pass solves for the step, not for its end: on stiff ground float32 rounds away the part of a whole acceleration on
+which the force depends. So jar and the links' accelerations are sums of steps, which become small.
 
-The cost that the solution minimises is convex, with the slope s.(f - H s - f(s)) after the step. Where it rises there,
-`search` goes back to where it is least.
+The cost that the solution minimises is convex, with the slope s.(f - H s - f(s)) after the step. Where the cost rises
+there, `line_search` shortens the step to where it is least.
 """
 
 from functools import cache
@@ -24,13 +24,13 @@ from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
-SEARCHES = 12  # evaluations of a line search, at most
-EDGE = 0.1  # least distance of its secants from the ends of its bracket, in multiples of its width
-ENOUGH = 0.1  # it ends this close to the least cost, in multiples of what the part of the step would gain at first
-NEAR = 0.05  # the slope after a whole step that is good enough, in multiples of the first one
-ROUND_OFF = 20.0  # of a step, in multiples of the float's epsilon and of the contacts' stiffness beside inertia
-ROWS = 10.0  # by how much more an acceleration can be off than each row alone says, which other rows hold: measured
-PATIENCE = 6, 2  # passes, and with dry friction, for which a whole step may end in a slope as large as the first one
+MAX_EVALUATIONS = 12  # evaluations of a line search
+BRACKET_MARGIN = 0.1  # least distance of a secant step from the ends of the bracket, in multiples of its width
+COST_TOLERANCE = 0.1  # the line search ends this close to the least cost, in multiples of alpha times the first slope
+SLOPE_TOLERANCE = 0.05  # slope at which a whole step is accepted, in multiples of the first slope
+ROUND_OFF = 20.0  # error of a step, in multiples of the float's epsilon and of contact stiffness over inertia
+COUPLING = 10.0  # safety factor: rows couple, so the true error exceeds that of single rows by up to this (measured)
+FULL_STEP_PASSES = 6, 2  # passes, and with dry friction, that accept a whole step with a slope up to the first one
 
 
 @cache
@@ -40,193 +40,221 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
     Links, Motions, Loads, Root, Newton = t.Links, t.Motions, t.Loads, t.Root, t.Newton
     joint, join, FLOATING = joint_law(spec), spatial(spec).join, spec.floating
     CONTACT, LIMIT, LOSS = spec.has("contact limit frictionloss")
-    HELD, SHARED, PATIENT = LIMIT or LOSS, spec.threads_per_env > 1, PATIENCE[LOSS]
+    JOINT_ROWS, SHARED, FULL_STEPS = LIMIT or LOSS, spec.threads_per_env > 1, FULL_STEP_PASSES[LOSS]
     ROUNDING = ROUND_OFF * (6e-8 if t.U == wp.float32 else 1.1e-16)
     FIRST = 0 if spec.floating else 1 + spec.inert  # the first link with inertia
 
     @wp.func
-    def begin(m: Model, here: Lane, links: Links, motions: Motions, loads: Loads, free: Loads, root: Root):
-        """No acceleration, where limits act as if the joints had run into them."""
-        motions[0].iterate = join(vec3(), -vec3(m.gravity) - wp.cross(wp.spatial_top(links[0].V), root.v))
+    def initialize(m: Model, here: Lane, links: Links, motions: Motions, loads: Loads, free_loads: Loads, root: Root):
+        """Set the iterate to zero acceleration, with limits that act as if each joint moved into its own."""
+        motions[0].accel_link = join(vec3(), -vec3(m.gravity) - wp.cross(wp.spatial_top(links[0].V), root.v))
         for i in range(here.n):
             k = here.at + i
-            free[i] = loads[i]
-            motions[i].rate = T(0.0)
+            free_loads[i] = loads[i]
+            motions[i].accel_joint = T(0.0)
             if i > 0:
                 q = links[i].q
                 qd = links[i].qd
-                motions[i].iterate = motions[m.parent[k]].iterate + motions[i].C
-                motions[i].force = joint.force(m, here, k, motions[i].motor, q, qd)
+                motions[i].accel_link = motions[m.parent[k]].accel_link + motions[i].C
+                motions[i].free_force = joint.force(m, here, k, motions[i].motor, q, qd)
                 if wp.static(LIMIT):
-                    motions[i].stop = constraint.stop(m, here, k, q, qd)
-                if wp.static(HELD):
-                    held = constraint.joint_constraint(m, k, motions[i].stop, qd, T(0.0), T(1.0))
-                    motions[i].held = held[0]
-                    motions[i].firm = held[1]
+                    motions[i].limit = constraint.limit_state(m, here, k, q, qd)
+                if wp.static(JOINT_ROWS):
+                    con = constraint.joint_constraint(m, k, motions[i].limit, qd, T(0.0), T(1.0))
+                    motions[i].con_force = con[0]
+                    motions[i].con_slope = con[1]
 
     @wp.func
-    def linearize(m: Model, here: Lane, motions: Motions, touches: t.Contacts, free: Loads, loads: Loads):
-        """Loads of the iterate, contacts included: what they and the joints' forces lack gives the next step."""
+    def linearize(m: Model, here: Lane, motions: Motions, contacts: t.Contacts, free_loads: Loads, loads: Loads):
+        """Compute the iterate's loads, contacts included: their imbalance with joint forces gives the next step."""
         for i in range(here.n):
-            load = free[i]
-            a = wp.spatial_top(motions[i].iterate)
-            l = wp.spatial_bottom(motions[i].iterate)
+            load = free_loads[i]
+            a = wp.spatial_top(motions[i].accel_link)
+            l = wp.spatial_bottom(motions[i].accel_link)
             load.f = load.f + join(load.a * a + load.b * l, a * load.b + load.d * l)
             if wp.static(CONTACT):
                 if i >= FIRST:
-                    load = constraint.add_contacts(m, here, here.at + i, touches, load)
+                    load = constraint.add_contacts(m, here, here.at + i, contacts, load)
             loads[i] = load
 
     @wp.func
-    def measure(m: Model, here: Lane, links: Links, motions: Motions, touches: t.Contacts, part: T, tries: int):
-        """Constraints after a part of the step s, the first try being all of it.
+    def evaluate_trial(
+        m: Model, here: Lane, links: Links, motions: Motions, contacts: t.Contacts, alpha: T, evaluation: int
+    ):
+        """Evaluate the constraints after the trial step alpha s; alpha is 1 in evaluation 0.
 
-        Returns (s.(f - part H s - f(part)), s.H s, s.H(part) s, the square of that difference of forces as
-        acceleration, how stiff contacts are beside inertia, 0).
+        Returns (s.(f - alpha H s - f(alpha s)), s.H s, s.H(alpha s) s, the square of that difference of forces as an
+        acceleration, the ratio of contact stiffness to inertia, 0).
         """
-        found = vec6()
+        total = vec6()
         for i in range(here.n):
             k = here.at + i
-            if wp.static(HELD):
+            if wp.static(JOINT_ROWS):
                 if i > 0:
                     step = motions[i].u
-                    if tries == 0:
-                        motions[i].given = motions[i].firm * step
-                    rate = motions[i].rate + part * step
-                    held = constraint.joint_constraint(m, k, motions[i].stop, links[i].qd, rate, T(0.0))
-                    less = motions[i].held - part * motions[i].given - held[0]
-                    w = T(m.limit_numbers[k][4])
-                    away = w * less / (T(1.0) + w * held[1])
-                    found = found + T(m.carried[k]) * vec6(
-                        step * less, step * motions[i].given, step * held[1] * step, away * away, T(0.0), T(0.0)
+                    linear = motions[i].con_slope * step
+                    accel = motions[i].accel_joint + alpha * step
+                    trial = constraint.joint_constraint(m, k, motions[i].limit, links[i].qd, accel, T(0.0))
+                    force_error = motions[i].con_force - alpha * linear - trial[0]
+                    w = T(m.limit_params[k][4])
+                    accel_error = w * force_error / (T(1.0) + w * trial[1])
+                    total = total + T(m.owned[k]) * vec6(
+                        step * force_error,
+                        step * linear,
+                        step * trial[1] * step,
+                        accel_error * accel_error,
+                        T(0.0),
+                        T(0.0),
                     )
-                    motions[i].holds = held[0]
-                    motions[i].firm = held[1]
+                    motions[i].trial_force = trial[0]
+                    motions[i].trial_slope = trial[1]
             if wp.static(CONTACT):
                 if i >= FIRST:
-                    found = found + constraint.try_contacts(m, here, k, motions[i].A, part, tries, touches)
+                    total = total + constraint.trial_contacts(m, here, k, motions[i].A, alpha, evaluation, contacts)
         if wp.static(SHARED):
             for r in range(5):
-                found[r] = sums.add(found[r])
-        return found
+                total[r] = sums.add(total[r])
+        return total
 
     @wp.func
-    def inertia_along(m: Model, here: Lane, motions: Motions, free: Loads):
-        """s.M s of the step s."""
+    def inertia_along(m: Model, here: Lane, motions: Motions, free_loads: Loads):
+        """Return s.M s of the step s."""
         inertia = T(0.0)
         for i in range(here.n):
             k = here.at + i
             a = wp.spatial_top(motions[i].A)
             l = wp.spatial_bottom(motions[i].A)
-            load = free[i]
+            load = free_loads[i]
             inertia = inertia + wp.dot(a, load.a * a + T(2.0) * (load.b * l)) + wp.dot(l, load.d * l)
             if i > 0:
-                inertia = inertia + T(m.carried[k]) * T(m.armature[k]) * motions[i].u * motions[i].u
+                inertia = inertia + T(m.owned[k]) * T(m.armature[k]) * motions[i].u * motions[i].u
         if wp.static(SHARED):
             inertia = sums.add(inertia)
         return inertia
 
     @wp.func
-    def search(part: T, bracket: vec4, first: T, slope: T, curvature: T, patience: T, tries: int):
-        """The next part of the step to try, or the same one if it will do; the bracket.
+    def next_trial(alpha: T, bracket: vec4, first: T, slope: T, curvature: T, slope_tolerance: T, evaluation: int):
+        """Return the next step length alpha to try, or the same one if it is accepted, and the bracket.
 
-        bracket: a part that is too short, the slope of the cost after it, the same of one that is too long; first:
-        minus the slope before the step. The slope grows with the part.
+        bracket: an alpha that is too small and the slope of the cost there, then the same of one that is too large;
+        first: minus the slope at alpha = 0. The slope grows with alpha.
         """
         excess = T(0.5) * slope * slope / curvature  # of the cost over its least
-        over = pick(T(ENOUGH) * first * part, excess, T(1.0), T(0.0))
-        whole = pick(part, T(1.0), T(0.0), T(1.0))
-        over = pick(T(0.0), whole, pick(patience * first, slope, T(1.0), T(0.0)), over)
-        long = pick(T(0.0), slope, over, T(0.0))
-        short = over - long
-        bracket[0] = pick(T(0.0), short, part, bracket[0])
+        rejected = pick(T(COST_TOLERANCE) * first * alpha, excess, T(1.0), T(0.0))
+        whole = pick(alpha, T(1.0), T(0.0), T(1.0))
+        rejected = pick(T(0.0), whole, pick(slope_tolerance * first, slope, T(1.0), T(0.0)), rejected)
+        long = pick(T(0.0), slope, rejected, T(0.0))
+        short = rejected - long
+        bracket[0] = pick(T(0.0), short, alpha, bracket[0])
         bracket[1] = pick(T(0.0), short, slope, bracket[1])
-        bracket[2] = pick(T(0.0), long, part, bracket[2])
+        bracket[2] = pick(T(0.0), long, alpha, bracket[2])
         bracket[3] = pick(T(0.0), long, slope, bracket[3])
         width = bracket[2] - bracket[0]
-        # Where the slope has a kink, Newton's method leaves the bracket, and secants come from one side only.
+        # At a kink of the slope, Newton's method leaves the bracket, and secants approach from one side only.
         secant = bracket[0] - width * bracket[1] / (bracket[3] - bracket[1])
-        inside = wp.max(wp.min(secant, bracket[2] - T(EDGE) * width), bracket[0] + T(EDGE) * width)
-        if tries > 1:
+        inside = wp.max(wp.min(secant, bracket[2] - T(BRACKET_MARGIN) * width), bracket[0] + T(BRACKET_MARGIN) * width)
+        if evaluation > 1:
             inside = bracket[0] + T(0.5) * width
-        following = part - slope / curvature
+        following = alpha - slope / curvature
         following = pick(bracket[0], following, pick(following, bracket[2], following, inside), inside)
-        if tries == SEARCHES - 1:  # a part that lowers the cost, if one is known
+        if evaluation == MAX_EVALUATIONS - 1:  # an alpha that lowers the cost, if one is known
             following = pick(T(0.0), bracket[0], bracket[0], following)
-        return pick(T(0.0), over, following, part), bracket
+        return pick(T(0.0), rejected, following, alpha), bracket
 
     @wp.func
-    def far_enough(
-        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Contacts, free: Loads, moved: T, by: Newton
+    def line_search(
+        # model
+        m: Model,
+        here: Lane,
+        # kinematics and inertia in
+        links: Links,
+        free_loads: Loads,
+        # iterate and trial step, in and out
+        motions: Motions,
+        contacts: t.Contacts,
+        step_sq: T,
+        status: Newton,
     ):
-        """The part of a step (moved: its square) after which the cost is least, or all of it if that is good enough."""
-        square = by.tolerance * by.tolerance
-        patience = T(wp.where(by.passes < PATIENT, 1.0, NEAR))
-        part = T(1.0)
-        rises = T(0.0)
+        """Return the step length alpha with the least cost, or 1 if a whole step is accepted; step_sq is |s|^2."""
+        tolerance_sq = status.tolerance * status.tolerance
+        slope_tolerance = T(wp.where(status.passes < FULL_STEPS, 1.0, SLOPE_TOLERANCE))
+        alpha = T(1.0)
+        overshoots = T(0.0)
         first = T(0.0)
         bracket = vec4()
-        tries = int(0)
-        while tries <= SEARCHES:
-            found = measure(m, here, links, motions, touches, part, tries)
-            rounding = T(ROUNDING) * found[4]
-            away = (T(1.0) - part) * (T(1.0) - part) + rounding * rounding
-            off = (T(ROWS * ROWS) * found[3] + away * moved) / by.size
-            by.off = pick(T(0.0), by.going, off, by.off)
-            if tries == 0 and by.passes > 0:
-                rises = pick(square, off, by.going * (found[0] - patience * found[1]), T(0.0))
-                if block.any_of(rises):
-                    first = inertia_along(m, here, motions, free) + found[1]
+        evaluation = int(0)
+        while evaluation <= MAX_EVALUATIONS:
+            total = evaluate_trial(m, here, links, motions, contacts, alpha, evaluation)
+            rounding = T(ROUNDING) * total[4]
+            remaining_sq = (T(1.0) - alpha) * (T(1.0) - alpha) + rounding * rounding
+            residual_sq = (T(COUPLING * COUPLING) * total[3] + remaining_sq * step_sq) / status.accel_sq
+            status.residual_sq = pick(T(0.0), status.active, residual_sq, status.residual_sq)
+            if evaluation == 0 and status.passes > 0:
+                rise = status.active * (total[0] - slope_tolerance * total[1])
+                overshoots = pick(tolerance_sq, residual_sq, rise, T(0.0))
+                if block.any_of(overshoots):
+                    first = inertia_along(m, here, motions, free_loads) + total[1]
                     bracket[1] = -first
-            tried = part
-            if tries < SEARCHES and block.any_of(rises):
-                slope = found[0] - (T(1.0) - part) * first
-                curvature = first - found[1] + found[2]
-                following, bracket = search(part, bracket, first, slope, curvature, patience, tries)
-                part = pick(T(0.0), rises, following, part)
-            tries = wp.where(block.any_of(wp.abs(part - tried)), tries + 1, SEARCHES + 1)
-        by.going = pick(square, by.off, by.going, T(0.0))
-        return part, by
+            last = alpha
+            if evaluation < MAX_EVALUATIONS and block.any_of(overshoots):
+                slope = total[0] - (T(1.0) - alpha) * first
+                curvature = first - total[1] + total[2]
+                following, bracket = next_trial(alpha, bracket, first, slope, curvature, slope_tolerance, evaluation)
+                alpha = pick(T(0.0), overshoots, following, alpha)
+            evaluation = wp.where(block.any_of(wp.abs(alpha - last)), evaluation + 1, MAX_EVALUATIONS + 1)
+        status.active = pick(tolerance_sq, status.residual_sq, status.active, T(0.0))
+        return alpha, status
 
     @wp.func
-    def step_on(
-        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Contacts, free: Loads, root: Root, by: Newton
+    def newton_step(
+        # model
+        m: Model,
+        here: Lane,
+        # kinematics and inertia in
+        links: Links,
+        free_loads: Loads,
+        # iterate and trial step, in and out
+        motions: Motions,
+        contacts: t.Contacts,
+        root: Root,
+        status: Newton,
     ):
-        """A step of the iterate in its direction, u and twists, where it goes on."""
-        by.size = T(0.0)
-        moved = T(0.0)
+        """Move the iterate by a Newton step, joints' u and links' A, in the environments that are active."""
+        status.accel_sq = T(0.0)
+        step_sq = T(0.0)
         for r in range(6):
-            motions[0].A[r] = pick(T(0.0), by.going, motions[0].A[r], T(0.0))
+            motions[0].A[r] = pick(T(0.0), status.active, motions[0].A[r], T(0.0))
         if wp.static(FLOATING):
             for k in range(3):
-                root.turning_up[k] = pick(T(0.0), by.going, root.turning_up[k], T(0.0))
-                root.speeding_up[k] = pick(T(0.0), by.going, root.speeding_up[k], T(0.0))
-            by.size = wp.length_sq(root.wdot + root.turning_up) + wp.length_sq(root.vdot + root.speeding_up)
-            moved = wp.length_sq(root.turning_up) + wp.length_sq(root.speeding_up)
-            by.size = T(m.carried[here.at]) * by.size
-            moved = T(m.carried[here.at]) * moved
+                root.wdot[k] = pick(T(0.0), status.active, root.wdot[k], T(0.0))
+                root.vdot[k] = pick(T(0.0), status.active, root.vdot[k], T(0.0))
+            status.accel_sq = wp.length_sq(root.newton_wdot + root.wdot) + wp.length_sq(root.newton_vdot + root.vdot)
+            step_sq = wp.length_sq(root.wdot) + wp.length_sq(root.vdot)
+            status.accel_sq = T(m.owned[here.at]) * status.accel_sq
+            step_sq = T(m.owned[here.at]) * step_sq
         for i in range(1, here.n):
-            step = pick(T(0.0), by.going, motions[i].u, T(0.0))
-            rate = motions[i].rate + step
+            step = pick(T(0.0), status.active, motions[i].u, T(0.0))
+            accel = motions[i].accel_joint + step
             motions[i].u = step
             motions[i].A = motions[m.parent[here.at + i]].A + links[i].S * step
-            by.size = by.size + T(m.carried[here.at + i]) * rate * rate
-            moved = moved + T(m.carried[here.at + i]) * step * step
+            status.accel_sq = status.accel_sq + T(m.owned[here.at + i]) * accel * accel
+            step_sq = step_sq + T(m.owned[here.at + i]) * step * step
         if wp.static(SHARED):
-            by.size = sums.add(by.size)
-            moved = sums.add(moved)
-        by.size = by.size + T(1.0)
-        part, by = far_enough(m, here, links, motions, touches, free, moved, by)
+            status.accel_sq = sums.add(status.accel_sq)
+            step_sq = sums.add(step_sq)
+        status.accel_sq = status.accel_sq + T(1.0)
+        alpha, status = line_search(m, here, links, free_loads, motions, contacts, step_sq, status)
         if wp.static(FLOATING):
-            root.wdot = root.wdot + part * root.turning_up
-            root.vdot = root.vdot + part * root.speeding_up
+            root.newton_wdot = root.newton_wdot + alpha * root.wdot
+            root.newton_vdot = root.newton_vdot + alpha * root.vdot
         for i in range(here.n):
-            motions[i].rate = motions[i].rate + part * motions[i].u
-            motions[i].iterate = motions[i].iterate + part * motions[i].A
-            motions[i].held = motions[i].holds
+            motions[i].accel_joint = motions[i].accel_joint + alpha * motions[i].u
+            motions[i].accel_link = motions[i].accel_link + alpha * motions[i].A
+            motions[i].con_force = motions[i].trial_force
+            motions[i].con_slope = motions[i].trial_slope
         if wp.static(CONTACT):
-            constraint.keep_contacts(m, here, touches)
-        by.passes = by.passes + 1
-        return root, by
+            constraint.accept_contacts(m, here, contacts)
+        status.passes = status.passes + 1
+        return root, status
 
     return functions(locals())

@@ -1,4 +1,4 @@
-"""The mass matrix: the sweeps that factorise it and solve for the accelerations, and M lambda = -h g by that factor."""
+"""The mass matrix: sweeps that factorise it and solve for accelerations, and M lambda = -h g with that factor."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -12,22 +12,23 @@ from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 
-NEWTON, FACTOR, SOLVE, DONE = range(4)  # a substep's solves: Newton's passes, the factor at their end, and one more
+# Phases of a substep: Newton's passes, the factor of the last iterate, the damped solve
+NEWTON, FACTOR, SOLVE, DONE = range(4)
 
 
 @cache
 def base_inertia(spec: KernelSpec) -> SimpleNamespace:
-    """Of the floating base: the Cholesky factor of its articulated inertia, and its damping."""
+    """Make the functions of a floating base: the Cholesky factor of its articulated inertia, and its damping."""
     t, kin = types(spec), kinematics(spec)
     T, vec3, vec6, mat3, mat6 = t.T, t.vec3, t.vec6, t.mat3, t.mat6
     load, store, join = kin.load, kin.store, spatial(spec).join
     Model, Lane, Link, Load, Root = t.Model, t.Lane, t.Link, t.Load, t.Root
     CONSTRAINED, IMPLICIT = spec.constrained, spec.implicit
-    BASE = 7 * (spec.nlink - 1)  # where the base's factor begins, packed by rows
+    BASE = 7 * (spec.nlink - 1)  # first column of the base's factor, packed by rows
 
     @wp.func
     def factor_base(Ia: mat3, Ib: mat3, Id: mat3, b: vec6):
-        """Cholesky factor (reciprocal diagonal) of the base's articulated inertia, and the solution of I a = b."""
+        """Return the Cholesky factor (reciprocal diagonal) of the base's articulated inertia I, and I^-1 b."""
         L = mat6()
         for r in range(3):
             for c in range(3):
@@ -66,7 +67,7 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def solve_base(ck_f: t.array3, row: int, e: int, b: vec6):
-        """I^-1 b with the base's stored Cholesky factor."""
+        """Return I^-1 b by the base's stored Cholesky factor."""
         a = b
         for r in range(6):
             y = a[r]
@@ -83,17 +84,17 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def damp_base(m: Model, here: Lane, last: bool, link: Link, load: Load, root: Root):
-        """The base's load with its damping, implicit where that of joints is: with constraints in the last solve."""
+        """Add damping to the base's load, implicit where that of joints is: with constraints in the damped solve."""
         b = T(m.base_damping)
         hb = here.h * b
         implicit = int(IMPLICIT)
         if wp.static(CONSTRAINED):
             implicit = wp.where(last, 1, 0)
         if wp.static(CONSTRAINED) and implicit == 1:
-            load.f = load.f + hb * join(link.R * root.wdot, root.vdot)
+            load.f = load.f + hb * join(link.R * root.newton_wdot, root.newton_vdot)
         else:
             load.f = load.f + b * link.V
-            if wp.static(IMPLICIT):  # of a spatial acceleration, which lacks w x v and gravity
+            if wp.static(IMPLICIT):  # of the spatial acceleration, which lacks w x v and gravity
                 load.f = load.f + hb * join(vec3(), wp.cross(wp.spatial_top(link.V), root.v) + vec3(m.gravity))
         if implicit == 1:
             load.a = load.a + wp.diag(vec3(hb, hb, hb))
@@ -105,7 +106,7 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
 
 @cache
 def articulated(spec: KernelSpec) -> SimpleNamespace:
-    """The sweeps of the articulated-body algorithm after the first one, which places the links."""
+    """Make the articulated-body algorithm's second and third sweep; the first one is place_links."""
     t, kin, base, sums, joint = types(spec), kinematics(spec), base_inertia(spec), lane_sums(spec), joint_law(spec)
     T, vec3, vec6, store, link_of, join = t.T, t.vec3, t.vec6, kin.store, kin.link_of, spatial(spec).join
     Model, Lane, Ck, Link, Load, Motion, Root = t.Model, t.Lane, t.Checkpoint, t.Link, t.Load, t.Motion, t.Root
@@ -116,28 +117,31 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def joint_force(m: Model, here: Lane, k: int, phase: int, link: Link, motion: Motion, d: T):
-        """(force of a joint, d with what its laws resist acceleration by)."""
-        free = T(1.0)
+        """Return a joint's force, and d = S . I S + armature with the implicit terms of its laws."""
+        unclamped = T(1.0)
         if wp.static(CLAMP):
-            free = joint.actuation_free(m, k, motion.motor, link.q, link.qd)
+            unclamped = joint.actuator_unclamped(m, k, motion.motor, link.q, link.qd)
         if wp.static(IMPLICIT):
-            resistance = joint.resistance(m, here, k, link.q, link.qd, free)
+            resistance = joint.resistance(m, here, k, link.q, link.qd, unclamped)
             d = d + here.h * resistance[1]
         if wp.static(CONSTRAINED):
             if phase == SOLVE:
-                damper = here.h * joint.damping(m, k, free)
+                damper = here.h * joint.damping(m, k, unclamped)
                 d = d + damper
-                f = -damper * motion.rate
+                f = -damper * motion.accel_joint
             else:
-                d = d + motion.firm
-                f = motion.force + motion.held - T(m.armature[k]) * motion.rate
+                d = d + motion.con_slope
+                f = motion.free_force + motion.con_force - T(m.armature[k]) * motion.accel_joint
         else:
             f = joint.force(m, here, k, motion.motor, link.q, link.qd)
         return f, d
 
     @wp.func
     def inward(m: Model, here: Lane, phase: int, ck: Ck, links: Links, motions: Motions, loads: Loads):
-        """Articulated inertias; of each joint U, 1/d and u, the first two into the checkpoint if here.keep is 1."""
+        """Compute articulated inertias and bias forces, and U, 1/d and u of each joint.
+
+        If here.store_factor is 1, U and 1/d go into the checkpoint.
+        """
         slots = int(SLOTS)
         if wp.static(SHARERS > 1):
             sums.sharers.add_loads(loads)
@@ -177,17 +181,18 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
                 motions[i].U = Ui
                 motions[i].dinv = di
                 motions[i].u = ui
-                if here.keep == 1:
+                if here.store_factor == 1:
                     f0 = 7 * (link_of(m, k) - 1)
                     for r in range(6):
-                        store(ck.f, here.factor, f0 + r, here.e, Ui[r])
-                    store(ck.f, here.factor, f0 + 6, here.e, di)
+                        store(ck.f, here.factor_row, f0 + r, here.e, Ui[r])
+                    store(ck.f, here.factor_row, f0 + 6, here.e, di)
 
     @wp.func
     def accelerate(m: Model, here: Lane, phase: int, ck: Ck, links: Links, motions: Motions, load: Load, root: Root):
-        """Accelerations, those of joints into u; load is the base's. Gravity acts as an acceleration of the base.
+        """Compute accelerations, those of joints into u; load is the base's.
 
-        With constraints they are those of a step, from forces that lack something, and zero without.
+        Gravity is an acceleration of the base. With constraints the accelerations are a Newton step, from the imbalance
+        of forces, and so without gravity and C.
         """
         motions[0].A = vec6()
         if wp.static(not CONSTRAINED):
@@ -197,13 +202,13 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
                 load = base.damp_base(m, here, phase == SOLVE, links[0], load, root)
             L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
             motions[0].A = a0
-            root.turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
-            root.speeding_up = wp.spatial_bottom(a0)
+            root.wdot = wp.transpose(links[0].R) * wp.spatial_top(a0)
+            root.vdot = wp.spatial_bottom(a0)
             if wp.static(not CONSTRAINED):
                 turning = wp.spatial_top(links[0].V)
-                root.speeding_up = wp.spatial_bottom(a0) + wp.cross(turning, root.v) + vec3(m.gravity)
-            if here.keep == 1:
-                base.store_base(ck.f, here.factor, here.e, L)
+                root.vdot = wp.spatial_bottom(a0) + wp.cross(turning, root.v) + vec3(m.gravity)
+            if here.store_factor == 1:
+                base.store_base(ck.f, here.factor_row, here.e, L)
         for i in range(1, here.n):
             ai = motions[m.parent[here.at + i]].A
             if wp.static(not CONSTRAINED):
@@ -227,9 +232,9 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
 
     @wp.func
     def solve(m: Model, here: Lane, ck: Ck, row: int, links: Links, nodes: Nodes, g_base: vec6):
-        """lambda = -M^-1 h g and the twists W under it, into nodes; g_base is a floating base's.
+        """Solve for lambda = -M^-1 h g and the twists W under it, into nodes; g_base is a floating base's.
 
-        On the way in, W holds the articulated bias force.
+        In the inward sweep, W holds the articulated bias force.
         """
         slots = int(SLOTS)
         h = here.h
@@ -265,24 +270,27 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
 
     @wp.func
     def solve_all(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
-        """lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
-        first, and g + h b lambda1 reaches the acceleration before it."""
+        """Solve for lambda = -M^-1 h g.
+
+        If damping follows the constraints, (M + h b) lambda1 = -h g comes first, with twists W1, and g + b lambda1 is
+        the adjoint of the acceleration before damping.
+        """
         g_base = vec6()
         if wp.static(FLOATING):
             g_base = join(links[0].R * base.gw, base.gv)
-        again = T(0.0)  # not T(s): where the loop is unrolled, float64(s) makes s itself a float
+        damping_pass = T(0.0)  # not T(s): where the loop is unrolled, float64(s) makes s itself a float
         for s in range(SOLVES):
             if wp.static(DAMPED and BASE_DAMPED):
-                g_base = g_base + again * T(m.base_damping) * nodes[0].W
+                g_base = g_base + damping_pass * T(m.base_damping) * nodes[0].W
             for i in range(here.n):
                 nodes[i].g = nodes[i].gqd
                 if wp.static(DAMPED):
                     nodes[i].W1 = nodes[i].W
-                    within = T(1.0)
+                    unclamped = T(1.0)
                     if wp.static(CLAMP):
-                        within = nodes[i].free
-                    nodes[i].g = nodes[i].gqd + again * joint.damping(m, here.at + i, within) * nodes[i].lam
+                        unclamped = nodes[i].unclamped
+                    nodes[i].g = nodes[i].gqd + damping_pass * joint.damping(m, here.at + i, unclamped) * nodes[i].lam
             solve(m, here, ck, SOLVES * here.row + s, links, nodes, g_base)
-            again = T(1.0)
+            damping_pass = T(1.0)
 
     return solve_all

@@ -1,4 +1,4 @@
-"""What the generated code of the kernels depends on; the numbers that it does not depend on are in model.py."""
+"""KernelSpec: all that the kernels' generated code depends on. A scene's numbers are in model.py."""
 
 import dataclasses
 from typing import Any
@@ -6,9 +6,9 @@ from typing import Any
 from diffsim.kernels.lanes import Division
 from diffsim.robot.scene import Scene
 
-FAR = 256.0  # m and rad, where rounding of a substep's motion to float32 begins to matter
-MAX_PLACE = 1e5  # m and rad; farther, float32 has no hundredth of either
-MAX_SPEED = 1e5  # m/s and rad/s; what is faster has blown up, and its squares would soon leave float32
+FAR = 256.0  # m and rad, beyond which rounding a substep's motion to float32 matters
+MAX_POSITION = 1e5  # m and rad; beyond, float32 does not resolve a hundredth
+MAX_SPEED = 1e5  # m/s and rad/s; beyond, the simulation has diverged, and squares would soon overflow float32
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class KernelSpec:
     dtype: type  # of the scene's numbers
     block: int = 1  # environments that one thread steps at once (wide.py)
     implicit: bool
-    varied: bool = False  # constants are multiplied by factors of each environment (factors.py)
+    varied: bool = False  # constants are multiplied by factors of each environment (lane.py)
     forced: int  # number of bodies that external forces act on (force.py), 0 without
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, block, component]
     # how threads share an environment (lanes.py); slots: the most links that one of them has
@@ -36,7 +36,7 @@ class KernelSpec:
     spheres: int = 0  # with constraints, the most contact spheres of a lane
 
     def has(self, names: str) -> list[bool]:
-        """Whether the scene has each of these features."""
+        """Return for each of these features whether the scene has it."""
         return [name in self.features for name in names.split()]
 
     @property
@@ -45,7 +45,7 @@ class KernelSpec:
 
     @property
     def dof0(self) -> int:
-        """Degrees of freedom of the base: joint i is dof0 + i - 1 in qvel."""
+        """Return the base's number of degrees of freedom: joint i is dof0 + i - 1 in qvel."""
         return 6 if self.floating else 0
 
     @property
@@ -58,29 +58,29 @@ class KernelSpec:
 
     @property
     def solves(self) -> int:
-        """Linear systems of a substep that its adjoint needs: MuJoCo's damping is one more, after the constraints'."""
+        """Return the number of solves in a substep's adjoint: MuJoCo's damping adds one to that of the constraints."""
         return 2 if self.damped else 1
 
     @property
     def damped(self) -> bool:
-        """Whether damping follows the constraints."""
+        """Tell whether damping follows the constraints."""
         return self.constrained and bool(self.features & {"damping", "base_damping"})
 
     @property
     def nfactor(self) -> int:
-        """Numbers of the cached factorisation: U and 1/d of each joint, the base's packed Cholesky factor."""
+        """Return the size of the stored factorisation: U and 1/d of each joint, the base's packed Cholesky factor."""
         return 7 * (self.nlink - 1) + (21 if self.floating else 0)
 
 
-def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = False, **asked: Any) -> KernelSpec:
-    """Of a scene whose environments are divided so; asked: fields that neither decides."""
-    limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
+def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = False, **options: Any) -> KernelSpec:
+    """Make the spec of a scene and a division of its environments; options are the fields that neither decides."""
+    limbs = division.threads_per_env > division.sharers  # lanes then have only the trunk's links in common
     return KernelSpec(
         **{name: getattr(scene, name) for name in ("nlink", "nu", "carrier", "nball", "features")},
         **{name: getattr(division, name) for name in ("threads_per_env", "sharers", "trunk", "slots")},
         dtype=dtype,
         forced=scene.nbody if forced else 0,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
-        spheres=max(map(len, division.spheres)) if asked.get("constrained") else 0,
-        **asked,
+        spheres=max(map(len, division.spheres)) if options.get("constrained") else 0,
+        **options,
     )

@@ -1,6 +1,6 @@
-"""Where a sphere touches the ground: a plane, or a piecewise-linear z(x).
+"""Distance of a sphere from the ground: a plane, or a piecewise-linear z(x).
 
-A sphere of radius r touches where its centre is nearer to the ground than r. Signed distance d, normal n and curvature
+A sphere of radius r touches if its centre is nearer to the ground than r. Signed distance d, normal n and curvature
 k of the centre's distance field are those of the nearest feature:
 
     a segment         d = (c - a) . n - r                           k = 0
@@ -13,7 +13,7 @@ two features are equally near: for a centre that is itself below a ridge, which 
 that the sphere does not fit into.
 
 The law of contact, be it contact.py's or constraint.py's, acts in the frame E = (t, y, n) of the feature. Its adjoint
-gains what turns that frame.
+includes the rotation of that frame.
 """
 
 from functools import cache
@@ -32,8 +32,8 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
     T, U, vec3, vec4, mat3, Model, uvec4 = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.scene.vec4
 
     @wp.func
-    def length_of(m: Model, row: int, i: int):
-        """Of segment i; the first and the last one have no end."""
+    def segment_length(m: Model, row: int, i: int):
+        """Return the length of segment i; the first and the last one are infinite."""
         a = m.terrain[row, i]
         b = m.terrain[row, i + 1]
         length = (b[0] - a[0]) * a[2] + (b[1] - a[1]) * a[3]
@@ -55,14 +55,14 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def in_valley(m: Model, row: int, i: int, x: U, z: U, r: U, otherwise: uvec4):
-        """(d, n_x, n_z, k) of a centre that both sides of the valley at vertex i push, or what it is otherwise."""
+        """Return (d, n_x, n_z, k) of a centre that both sides of the valley at vertex i push, else `otherwise`."""
         result = otherwise
         if i > 0 and i + 1 < m.terrain.shape[1]:
             a = m.terrain[row, i - 1]
             b = m.terrain[row, i]
             sine = a[2] * b[3] - a[3] * b[2]
             cosine = a[2] * b[2] + a[3] * b[3]
-            fits = r * sine <= (U(1.0) + cosine) * wp.min(length_of(m, row, i - 1), length_of(m, row, i))
+            fits = r * sine <= (U(1.0) + cosine) * wp.min(segment_length(m, row, i - 1), segment_length(m, row, i))
             if sine > U(0.0) and fits:
                 scale = r / (U(1.0) + cosine)
                 wx = b[0] - scale * (a[3] + b[3]) - x
@@ -74,13 +74,13 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def nearest(m: Model, row: int, x: U, z: U, r: U, reach: U):
-        """(d, n_x, n_z, k) of the centre (x, z); over the ground exact for centres nearer than `reach` only."""
+        """Return (d, n_x, n_z, k) of the centre (x, z); over the ground exact only for centres nearer than `reach`."""
         last = m.terrain.shape[1] - 1
         below = segment_below(m, row, x)
         a = m.terrain[row, below]
         above = z - a[1] - (x - a[0]) * a[3] / a[2]
         result = uvec4(above - r, U(0.0), U(1.0), U(0.0))
-        # The nearest point is no farther than the one straight below or above: nor is it so in x.
+        # The nearest point is at most as far as the one straight below or above, and so is its x.
         bound = wp.abs(above)
         if above > U(0.0):
             bound = wp.min(above, reach)
@@ -95,7 +95,7 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
             dx = x - b[0]
             dz = z - b[1]
             s = dx * b[2] + dz * b[3]
-            length = length_of(m, row, i)
+            length = segment_length(m, row, i)
             at = int(0)
             if s < U(0.0) and i > 0:
                 s = U(0.0)
@@ -127,7 +127,7 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def nearest_of_each(m: Model, b: int, x: T, z: T, r: U, reach: T):
-        """nearest(), of each of the block's environments with its own profile."""
+        """Call nearest() for each of the block's environments with its own profile."""
         result = vec4()
         for k in range(BLOCK):
             row = (BLOCK * b + k) % m.terrain.shape[0]
@@ -138,21 +138,21 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def frame_of(hit: vec4):
-        """E of what nearest() returns."""
+        """Return the frame E of a result of nearest()."""
         return mat3(hit[2], T(0.0), hit[1], T(0.0), T(1.0), T(0.0), -hit[1], T(0.0), hit[2])
 
     @wp.func
-    def distance(m: Model, here: t.Lane, c: int, centre: vec3, place: t.Place, reach: T):
-        """(d, E, k) of contact sphere c, see nearest(); over a plane E is the world's and k is 0."""
+    def distance(m: Model, here: t.Lane, c: int, centre: vec3, carrier: t.CarrierPos, reach: T):
+        """Return (d, E, k) of contact sphere c, see nearest(); over a plane E is the world's and k is 0."""
         if wp.static(TERRAIN):
-            hit = nearest_of_each(m, here.e, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
+            hit = nearest_of_each(m, here.e, carrier[0] + centre[0], carrier[1] + centre[2], m.contact_radius[c], reach)
             return hit[0], frame_of(hit), hit[3]
         else:
-            return place + centre[2] - T(m.contact_radius[c]), T(1.0), T(0.0)
+            return carrier + centre[2] - T(m.contact_radius[c]), T(1.0), T(0.0)
 
     @wp.func
     def in_frame(E: t.Frame, v: vec3):
-        """A world vector in the frame of a contact, in which the law acts."""
+        """Transform a world vector to a contact's frame, in which the law acts."""
         if wp.static(TERRAIN):
             return wp.transpose(E) * v
         return v

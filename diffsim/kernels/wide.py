@@ -1,12 +1,12 @@
-"""Blocks of environments: on a CPU one pass of a kernel serves 8 or 16 of them, each number a vector of theirs.
+"""Blocks of environments: on a CPU one thread steps 8 or 16 of them at once, each number a vector.
 
-Warp has no such type. So in these kernels the numbers that environments have of their own (T) are float64 to Warp, and
-the C++ below, which Warp puts between its headers and the kernel, makes `float64` a vector of floats: clang maps it to
-the machine's registers, however wide they are. A scene's numbers (U) stay float32. The same source with T = U is the
-kernel of one environment, for float64 and for GPUs.
+Warp has no such type. So in these kernels the numbers that differ between environments (T) are float64 to Warp, and the
+C++ below, which Warp puts between its headers and the kernel, makes `float64` a vector of floats: clang maps it to the
+machine's registers, however wide they are. A scene's numbers (U) stay float32. The same source with T = U is the kernel
+of one environment, for float64 and for GPUs.
 
-Environments decide each for themselves, so a kernel has no branch on their numbers: `pick` chooses between two values,
-and what stands behind `any_of` is computed for the whole block, and must be nothing to those whom it does not concern.
+A kernel must not branch on an environment's numbers: `pick` selects one of two values per environment. Code behind
+`any_of` runs for the whole block, and must not change the environments for which the condition is false.
 
 Warp's own templates do not find functions that are declared after them, so those that call one are overloaded here.
 """
@@ -80,7 +80,7 @@ inline wide tan(wide x) { return sin(x) / cos(x); }
 
 
 def module_options(spec: KernelSpec) -> dict[str, Any]:
-    """Warp's options of a kernel's module."""
+    """Return Warp's options of a kernel's module."""
     # On the CPU unrolling buys no speed and costs a second of compilation; a GPU keeps small matrices in registers.
     options: dict[str, Any] = {"enable_backward": False, "max_unroll": 6 if spec.env_last else 1}
     if not spec.env_last:
@@ -97,19 +97,19 @@ def module_options(spec: KernelSpec) -> dict[str, Any]:
 
 @cache
 def blocks(spec: KernelSpec) -> SimpleNamespace:
-    """Choices, and what a block reads of its environments' rows and writes there."""
+    """Make the functions of a block: selection, and access to its environments' rows."""
     t, BLOCK = types(spec), spec.block
     T, U, array2, flags, counts = t.T, t.U, t.array2, wp.array(dtype=wp.bool), wp.array(dtype=int)
     wide = BLOCK > 1
 
     @wp.func_native("return a < b ? x : y;")
     def pick(a: T, b: T, x: T, y: T) -> T:
-        """x where a < b, else y."""
+        """Return x where a < b, else y."""
         ...
 
     @wp.func_native("return __builtin_reduce_or(x > 0.0f);" if wide else "return x > 0.0;")
     def any_of(x: T) -> bool:
-        """Whether x > 0 in any environment of the block."""
+        """Tell whether x > 0 in any environment of the block."""
         ...
 
     @wp.func_native(
@@ -117,13 +117,13 @@ def blocks(spec: KernelSpec) -> SimpleNamespace:
         if wide
         else "return isfinite(x) ? 0.0 : 1.0;"
     )
-    def broken(x: T) -> T:
-        """1 where x is not finite, else 0."""
+    def is_nonfinite(x: T) -> T:
+        """Return 1 where x is not finite, else 0."""
         ...
 
     @wp.func_native("return x[k];" if wide else "return x;")
     def element(x: T, k: int) -> U:
-        """That of the block's environment k."""
+        """Return the number of the block's environment k."""
         ...
 
     @wp.func_native("x[k] = value; return x;" if wide else "return value;")
@@ -131,7 +131,7 @@ def blocks(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def env_of(b: int, k: int, envs: int):
-        """Number of block b's environment k; the last block is filled up with the last environment."""
+        """Return the index of block b's environment k; the last block is filled up with the last environment."""
         return wp.min(BLOCK * b + k, envs - 1)
 
     @wp.func
@@ -163,7 +163,7 @@ def blocks(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def count(a: counts, b: int, x: T):
-        """One more where x > 0."""
+        """Increment the count where x > 0."""
         for k in range(BLOCK):
             if BLOCK * b + k < a.shape[0] and element(x, k) > U(0.0):
                 a[BLOCK * b + k] = a[BLOCK * b + k] + 1

@@ -1,1 +1,1 @@
-"""A robot: from an MJCF file to a scene, or to one clear message."""
+"""Robots: read an MJCF file into a scene, or refuse it with one clear message."""

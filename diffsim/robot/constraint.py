@@ -1,6 +1,6 @@
-"""MuJoCo's own constraints of a robot: what its file asks for by solref, solimp, friction, margin and frictionloss.
+"""MuJoCo's constraints of a robot, from its file's solref, solimp, friction, margin and frictionloss.
 
-Nothing here is fitted; MuJoCo's documentation, "Computation", has the law, kernels/constraint.py the equations.
+Nothing here is fitted. MuJoCo's documentation, "Computation", defines the law; kernels/constraint.py has the equations.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from diffsim.robot.contact import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, SceneError
 
-# MuJoCo's own bounds: of an impedance, and of the friction of a contact that has any
+# MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
 
 
 def constrained(scene: Scene, seconds: float) -> Scene:
-    """A copy with MuJoCo's constraints in substeps of that length; raises SceneError for what of the file they lack."""
+    """Return a copy with MuJoCo's constraints for that length of a substep; raises SceneError if unsupported."""
     m = scene.mj_model
     if found := list(_obstacles(scene)):
         raise SceneError(f"{scene.name}: on MuJoCo's contact {'; '.join(found)}")
@@ -47,7 +47,7 @@ def constrained(scene: Scene, seconds: float) -> Scene:
 
 
 def check_soft(scene: Scene) -> None:
-    """Raises SceneError where soft contact lacks what the file asks for, or the file a constant of soft contact."""
+    """Raise SceneError if soft contact does not support the file, or the file lacks a constant of soft contact."""
     m = scene.mj_model
     joints = np.unique(m.dof_jntid[m.dof_frictionloss > 0]).tolist()
     if joints:
@@ -80,7 +80,7 @@ def _obstacles(scene: Scene) -> Iterator[str]:
 
 
 def _numbers(solref: ArrayLike, solimp: ArrayLike, weight: float, margin: float, fastest: float = 0.0) -> Array:
-    """A row of Constraints.contact without friction; no time constant is below `fastest`."""
+    """Compute a row of Constraints.contact without friction; no time constant is below `fastest`."""
     (first, second), (start, end, width, middle, power) = np.asarray(solref), np.asarray(solimp)
     start, end, middle = np.clip((start, end, middle), LEAST, MOST)
     if first > 0:

@@ -1,4 +1,4 @@
-"""Which geoms touch, by which numbers of the file, at which points, and how these move over the ground."""
+"""Contacts of a robot: pairs of geoms, their parameters, their contact points, and the slip of these on the ground."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from diffsim.robot.scene import Array, Index, Scene
 HULL_POINTS = 16  # of a mesh, at most
 _CORNERS = np.array([[x, y, z] for y in (-1, 1) for x in (-1, 1) for z in (-1, 1)], float)
 _RIM = np.array([[np.cos(turn), np.sin(turn), z] for z in (-1, 1) for turn in np.arange(8) * np.pi / 4])
-# Where a geom's contact points are, by its type: along its axes, in half lengths; a mesh has its own
+# Contact points of a geom by its type, along its axes in half lengths; a mesh has its own
 POINTS = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): np.zeros((1, 3)),
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]),
@@ -28,17 +28,17 @@ POINTS = {
 
 
 class PairLaw(NamedTuple):
-    """A contact between two geoms, by MuJoCo's rules for what the two ask for."""
+    """Parameters of a contact between two geoms, mixed by MuJoCo's rules."""
 
     condim: int
     friction: float
     solref: Array  # (2,)
     solimp: Array  # (5,)
-    margin: float  # m, the distance at which it begins
+    margin: float  # m, distance at which the contact begins
 
 
 def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
-    """(fixed geom, moving geom) that may touch; what is part of the robot's own base is no ground."""
+    """List (fixed geom, moving geom) that may touch; geoms of the robot's own base are no ground."""
     weld = m.body_weldid[m.geom_bodyid]
     moving, ground = np.flatnonzero(weld), np.flatnonzero((weld == 0) & ~base_geoms(m))
     pairs = {(s, g): None for s in ground.tolist() for g in moving[_collide(m, s, moving)].tolist()}
@@ -47,14 +47,14 @@ def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def base_geoms(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """(ngeom,) of bodies that are fixed to the world and carry moving ones, planes and height fields aside."""
+    """Mark geoms (ngeom,) of bodies fixed to the world with moving children, without planes and height fields."""
     carries = np.isin(m.body_rootid, m.body_rootid[m.body_weldid > 0])
     flat = (m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (m.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
     return carries[m.geom_bodyid] & (m.body_weldid[m.geom_bodyid] == 0) & (m.geom_bodyid > 0) & ~flat
 
 
 def declared_pairs(m: mujoco.MjModel) -> dict[tuple[int, int], int]:
-    """The <pair> of two geoms, the lower one first, where the file has one."""
+    """Map two geoms, the lower one first, to their <pair> in the file."""
     if disabled_flags(m) & {"constraint", "contact"}:
         return {}
     ends = np.sort(np.column_stack((m.pair_geom1, m.pair_geom2)), axis=1).tolist()
@@ -62,7 +62,7 @@ def declared_pairs(m: mujoco.MjModel) -> dict[tuple[int, int], int]:
 
 
 def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """The robot's geoms, each with the later ones of other bodies that it may touch."""
+    """Yield the robot's geoms, each with the later ones of other bodies that it may touch."""
     weld = m.body_weldid[m.geom_bodyid]
     parent = m.body_weldid[m.body_parentid[weld]]
     filters = "filterparent" not in disabled_flags(m)
@@ -84,9 +84,10 @@ def _collide(m: mujoco.MjModel, a: int, b: NDArray[np.int64]) -> NDArray[np.bool
 
 
 def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
-    """The geom of higher priority decides; of equals friction and condim are the larger, solref and solimp the mean.
+    """Mix the parameters of two geoms as MuJoCo does.
 
-    A <pair> of the two has its own numbers.
+    The geom of higher priority decides. Of equal ones friction and condim are the larger, solref and solimp the mean.
+    A <pair> of the two has its own parameters.
     """
     if (pair := declared_pairs(m).get((min(a, b), max(a, b)))) is not None:
         margin = m.pair_margin[pair] - (0.0 if _margins_add() else m.pair_gap[pair])
@@ -110,7 +111,7 @@ def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
 
 @cache
 def _margins_add() -> bool:
-    """Whether a contact acts within the sum of its geoms' margins; in older versions it is the larger, less the gap."""
+    """Tell whether this MuJoCo adds the margins of two geoms; older versions take the larger one, less the gap."""
     geom = '<geom type="{}" size="1 1 1" margin="1"/>'
     body = f"<body><freejoint/>{geom.format('sphere')}</body>"
     m = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geom.format('plane')}{body}</worldbody></mujoco>")
@@ -120,7 +121,7 @@ def _margins_add() -> bool:
 
 
 def contact_points(m: mujoco.MjModel, geom: int) -> tuple[Array, float]:
-    """(n, 3) centres, in the geom's frame, of the spheres that touch in its place, and their radius."""
+    """Return the centres (n, 3), in the geom's frame, of the spheres that stand for it, and their radius."""
     kind, size = mujoco.mjtGeom(m.geom_type[geom]), m.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return _spread(_hull(m, m.geom_dataid[geom])), 0.0
@@ -131,7 +132,7 @@ def contact_points(m: mujoco.MjModel, geom: int) -> tuple[Array, float]:
 
 
 def _hull(m: mujoco.MjModel, mesh: int) -> Array:
-    """(n, 3) corners of a mesh's convex hull, or all of its vertices where MuJoCo has made no hull."""
+    """Return the vertices (n, 3) of a mesh's convex hull, or all of its vertices if MuJoCo has made no hull."""
     vertices: Array = m.mesh_vert[m.mesh_vertadr[mesh] :][: m.mesh_vertnum[mesh]].astype(float)
     if m.mesh_graphadr[mesh] < 0:
         return vertices
@@ -140,7 +141,7 @@ def _hull(m: mujoco.MjModel, mesh: int) -> Array:
 
 
 def _spread(points: Array) -> Array:
-    """At most HULL_POINTS of them: the extremes along each axis, then each time the farthest from all before."""
+    """Choose at most HULL_POINTS: the extremes along each axis, then repeatedly the farthest from all before."""
     chosen = list(dict.fromkeys([*points.argmin(0).tolist(), *points.argmax(0).tolist()]))
     distance = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(1)
     while len(chosen) < HULL_POINTS and distance.max() > 0.02 * np.ptp(points, axis=0).max():
@@ -150,12 +151,12 @@ def _spread(points: Array) -> Array:
 
 
 def contact_bodies(scene: Scene) -> Index:
-    """(ncontact,) MuJoCo's number of the body of each contact sphere."""
+    """Return MuJoCo's number of the body (ncontact,) of each contact sphere."""
     return scene.mj_model.dof_bodyid[scene.contact_link + (5 if scene.floating else -1)]  # a link's last dof
 
 
 def trace(scene: Scene, qpos: Array) -> tuple[Array, Array]:
-    """Depth (F, nc) below and slide (F - 1, nc) along the ground of contact spheres' lowest points, m; qpos (F, nq)."""
+    """Compute depth (F, nc) and slip (F - 1, nc) [m] of the contact spheres' lowest points for qpos (F, nq)."""
     model, data, bodies = scene.mj_model, mujoco.MjData(scene.mj_model), contact_bodies(scene)
     # A link's frame has the axes of its body and sits at the anchor of its joint.
     centre = model.jnt_pos[model.body_jntadr[bodies] + model.body_jntnum[bodies] - 1] + scene.contact_position

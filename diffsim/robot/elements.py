@@ -1,4 +1,4 @@
-"""What a compiled MJCF says beyond its arrays: names, flags, kinds of actuators, and its inertia."""
+"""Elements of a compiled MJCF: names, flags, kinds of actuators, and the mass matrix."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_NAMES = 8  # in one message
 
 
 def label(m: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
-    """The quoted name of an element, or its number and its body's name."""
+    """Return the quoted name of an element, or its number and its body's name."""
     if name := mujoco.mj_id2name(m, kind, index):
         return repr(name)
     bodies = {Kind.mjOBJ_GEOM: m.geom_bodyid, Kind.mjOBJ_JOINT: m.jnt_bodyid, Kind.mjOBJ_SITE: m.site_bodyid}
@@ -25,49 +25,49 @@ def label(m: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Some names, and how many there are besides."""
+    """Join the first names, with the number of the others."""
     first = list(names)
     more = [f"and {len(first) - MOST_NAMES} more"] if len(first) > MOST_NAMES + 1 else []
     return ", ".join([*(first[:MOST_NAMES] if more else first), *more])
 
 
 def numeric(m: mujoco.MjModel, name: str) -> Array:
-    """The numbers of the <custom><numeric> of that name; none if the file has no such element."""
+    """Return the numbers of the <custom><numeric> of that name; none if the file has no such element."""
     index = mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, name)
     return m.numeric_data[m.numeric_adr[index] :][: m.numeric_size[index]] if index >= 0 else np.zeros(0)
 
 
 def floating(m: mujoco.MjModel) -> bool:
-    """Whether the robot has a free joint."""
+    """Tell whether the robot has a free joint."""
     return bool((m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
 
 
 def motors(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """(actuators,) whose force is their control times a constant."""
+    """Mark actuators whose force is their control times a constant."""
     still, unbiased = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
     return still & unbiased & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
 
 
 def servos(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """(actuators,) whose force besides is a spring and a damper on what they move: <position>, <velocity>."""
+    """Mark actuators that add a spring and a damper: <position>, <velocity>."""
     still, affine = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
     return still & affine & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
 
 
 def control_range(m: mujoco.MjModel) -> tuple[Array, Array]:
-    """(nu,) lowest and highest control of each actuator, for which actions of -1 and 1 stand."""
+    """Return the controls (nu,) of each actuator to which actions of -1 and 1 are mapped."""
     tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
     low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
     return low, np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
 
 
 def disabled_flags(m: mujoco.MjModel) -> set[str]:
-    """Names of <flag> that the file disables."""
+    """Return the names of <flag> that the file disables."""
     return _set_bits(mujoco.mjtDisableBit.__members__, "mjDSBL_", m.opt.disableflags)
 
 
 def enabled_flags(m: mujoco.MjModel) -> set[str]:
-    """Names of <flag> that the file enables and that are not so by default."""
+    """Return the names of <flag> that the file enables and that are not enabled by default."""
     return _set_bits(mujoco.mjtEnableBit.__members__, "mjENBL_", m.opt.enableflags)
 
 
@@ -77,7 +77,7 @@ def _set_bits(bits: Mapping[str, int], prefix: str, flags: int) -> set[str]:
 
 
 def at_rest(m: mujoco.MjModel) -> mujoco.MjData:
-    """Where everything is in the reference pose."""
+    """Compute MuJoCo's kinematics of the reference pose."""
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
     mujoco.mj_comPos(m, data)
@@ -85,7 +85,10 @@ def at_rest(m: mujoco.MjModel) -> mujoco.MjData:
 
 
 def mass_matrix(m: mujoco.MjModel) -> Array:
-    """(nv, nv) in the reference pose; armature included. MuJoCo's own takes the slides of one body for independent."""
+    """Compute the mass matrix (nv, nv) of the reference pose with armature.
+
+    MuJoCo's own treats the slides of one body as independent.
+    """
     data, matrix = at_rest(m), np.diag(m.dof_armature)
     mujoco.mj_crb(m, data)
     moved, (angular, linear) = data.crb[m.dof_bodyid], np.split(data.cdof, 2, axis=1)

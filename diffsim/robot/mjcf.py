@@ -1,4 +1,4 @@
-"""MJCF -> Scene, by way of MuJoCo's compiler; refuse.py names what is not simulated."""
+"""Read an MJCF file into a Scene with MuJoCo's compiler; refuse.py names what is not simulated."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _refuse(file: Path, found: list[str]) -> None:
 
 
 def _obey_flags(m: mujoco.MjModel) -> None:
-    """Take out of the compiled model what <flag ...="disable"/> switches off."""
+    """Remove from the compiled model what <flag ...="disable"/> switches off."""
     off = disabled_flags(m)
     if "constraint" in off:
         off |= {"contact", "equality", "frictionloss", "limit"}
@@ -89,7 +89,7 @@ class _Reader:
         self.nlink = 1 + model.nv - self.first
         self.parent = np.zeros(self.nlink, np.int32)
         self.rotation, self.position = np.tile(np.eye(3), (self.nlink, 1, 1)), np.zeros((self.nlink, 3))
-        # Of each body: its link (-1: fixed to the world of a floating scene) and its pose in the link's frame.
+        # Each body's link (-1: fixed to the world of a floating scene) and its pose in the link's frame.
         self.body: list[tuple[int, Array, Array]] = [(-1 if self.first else 0, np.eye(3), np.zeros(3))]
 
     def scene(self) -> Scene:
@@ -124,7 +124,7 @@ class _Reader:
         )
 
     def _link(self, joint: int) -> int:
-        """The first link of a joint."""
+        """Return the first link of a joint."""
         return int(self.m.jnt_dofadr[joint]) - self.first + 1
 
     def _read_body(self, body: int) -> None:
@@ -147,7 +147,7 @@ class _Reader:
         self.body.append((link, rotation, position))
 
     def _joints(self) -> dict[str, Any]:
-        """Columns (nlink, ...) of the joints; zeros of the base."""
+        """Read the joints into columns (nlink, ...), zero for the base."""
         m, kind = self.m, mujoco.mjtJoint
         dof = np.arange(self.first, m.nv)
         joint = m.dof_jntid[dof]
@@ -171,7 +171,7 @@ class _Reader:
         }
 
     def _springs(self, joint: NDArray[np.int32], ball: NDArray[np.bool_]) -> dict[str, tuple[Array, float]]:
-        """Of each degree of freedom after the base: springs, dampers and servos, and what the base has."""
+        """Read springs, dampers and servos of each degree of freedom after the base, and the base's value of each."""
         m = self.m
         servo, (low, high) = self._servos(), self._force_bounds()
         bounded = np.isfinite(low) | np.isfinite(high)
@@ -193,7 +193,7 @@ class _Reader:
         }
 
     def _servos(self) -> Array:
-        """(3, joints) of the affine biases of their actuators: force at zero, stiffness and damping."""
+        """Sum the affine biases (3, joints) of the joints' actuators: force at zero, stiffness and damping."""
         m, sums = self.m, np.zeros((3, self.nlink - 1))
         for a in np.flatnonzero(servos(m)).tolist():
             link, gear = self._gear(a)
@@ -201,7 +201,7 @@ class _Reader:
         return sums
 
     def _force_bounds(self) -> Array:
-        """(2, joints) what the sum of the forces of each one's actuators is kept within."""
+        """Read the bounds (2, joints) of the total force of each joint's actuators."""
         m, bounds = self.m, np.tile((-np.inf, np.inf), (self.nlink - 1, 1))
         driven = m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
         for a in np.flatnonzero(driven & (m.actuator_forcelimited != 0)).tolist():  # the only one on its joint
@@ -214,7 +214,7 @@ class _Reader:
         return bounds.T
 
     def _inertias(self) -> dict[str, Any]:
-        """mass, com, inertia and gravity compensation (nlink, ...) of the bodies that are welded together."""
+        """Sum mass, com, inertia and gravity compensation (nlink, ...) over bodies that are welded together."""
         m = self.m
         mass, moment, inertia = np.zeros(self.nlink), np.zeros((self.nlink, 3)), np.zeros((self.nlink, 3, 3))
         lift, lifted, base_damping = np.zeros(self.nlink), np.zeros((self.nlink, 3)), np.zeros(self.nlink)
@@ -239,7 +239,7 @@ class _Reader:
         return {"mass": mass, "com": com, "inertia": about_com} | of_gravity
 
     def _actuators(self, springs: Array) -> dict[str, Any]:
-        """Columns (nu, ...); without a spring on their link, the constant forces of servos are the motors'."""
+        """Read actuators into columns (nu, ...); a servo's constant force is a motor's if its link has no spring."""
         m = self.m
         tendon, (low, high) = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, control_range(m)
         link, scale = np.zeros(m.nu, np.int32), np.zeros(m.nu)
@@ -263,7 +263,7 @@ class _Reader:
         }
 
     def _gear(self, a: int) -> tuple[int, float]:
-        """Link of a joint's actuator, and the joint's force per force of the actuator."""
+        """Return the link of a joint's actuator, and the joint's force per force of the actuator."""
         m = self.m
         joint, axis = m.actuator_trnid[a, 0], 0
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
@@ -271,7 +271,7 @@ class _Reader:
         return self._link(joint) + axis, m.actuator_gear[a, axis]
 
     def _strength(self, a: int) -> float:
-        """Force of a tendon's actuator per activation."""
+        """Return the force of a tendon's actuator per activation."""
         m, strength, gain = self.m, self._numeric("muscle_strength", 1.0), self.m.actuator_gainprm[a]
         if motors(m)[a]:
             return -strength * m.actuator_gear[a, 0] * gain[0]
@@ -279,7 +279,7 @@ class _Reader:
         return strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
 
     def _path(self, tendon: int, actuator: int) -> list[Segment]:
-        """The segments of a tendon between two links."""
+        """Return a tendon's segments between two links."""
         m, points = self.m, list[tuple[int, Array]]()
         for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
             link, rotation, position = self.body[m.site_bodyid[site]]
@@ -317,7 +317,7 @@ class _Reader:
         return Spheres(np.repeat(links, counts), np.concatenate(centres), np.repeat(radii, counts), geom_of)
 
     def _outer(self, spheres: Spheres, slide: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """By link, the spheres that do not lie inside another one in every pose: overlapping capsules count once."""
+        """Select, by link, spheres that are not inside another one in every pose: overlapping capsules count once."""
         order = np.argsort(-spheres.radius, kind="stable")
         # Where each is in the frame of the first link that sees it at rest: a centre on a hinge's anchor stays there.
         at, centres, radii = spheres.link[order], spheres.centre[order], spheres.radius[order]

@@ -1,4 +1,4 @@
-"""What an MJCF file asks for and the simulator does not do: rows of (kind, which, why), which become lines."""
+"""Refuse what an MJCF file has and the simulator does not support: rows of (kind, which, why) become lines."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ ONLY_DRAWN = "; set contype and conaffinity to 0 if only drawn"
 
 
 def obstacles(m: mujoco.MjModel) -> list[str]:
-    """One line per reason, with the names of all elements that it holds for; empty if the file can be simulated."""
+    """Return a line per reason with the names of all its elements; none if the file can be simulated."""
     lines = []
     for rows in (_file, _numbers, _bodies, _joints, _inertia, _tendons, _actuators, _contacts):
         for kind, which, why in rows(m):
@@ -66,7 +66,7 @@ def obstacles(m: mujoco.MjModel) -> list[str]:
 
 
 def beyond(scene: Scene) -> list[str]:
-    """Likewise of arrays whose numbers are none, or too large for the kernels' single precision."""
+    """Return such a line for arrays that are not finite in the kernels' single precision."""
     names = []
     for name, values in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
         if isinstance(values, float | np.ndarray) and np.asarray(values).dtype == np.float64:
@@ -144,7 +144,7 @@ def _inertia(m: mujoco.MjModel) -> Iterator[Row]:
 
 
 def _tendons(m: mujoco.MjModel) -> Iterator[Row]:
-    """One without force of its own and without actuator has no effect, whatever its path."""
+    """Check tendons with actuators; a tendon without actuator and without a force of its own has no effect."""
     spatial, held = np.ones(m.ntendon, bool), np.zeros(m.nsite, bool)
     for tendon in np.unique(m.actuator_trnid[m.actuator_trntype == Transmission.mjTRN_TENDON, 0]).tolist():
         path = slice(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
@@ -174,7 +174,7 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Row]:
 
 
 def _turns(m: mujoco.MjModel) -> Mask:
-    """Motors and servos of a hinge or of a slide, and motors of one axis of a ball joint."""
+    """Mark motors and servos of a hinge or of a slide, and motors of one axis of a ball joint."""
     turns = (motors(m) | servos(m)) & (m.actuator_trntype == Transmission.mjTRN_JOINT)
     found = np.flatnonzero(turns)
     kind, axes = m.jnt_type[m.actuator_trnid[found, 0]], np.count_nonzero(m.actuator_gear[found, :3], axis=1)
@@ -183,7 +183,7 @@ def _turns(m: mujoco.MjModel) -> Mask:
 
 
 def _pulls(m: mujoco.MjModel, count: int) -> Mask:
-    """A <muscle>, or a motor that can only shorten its tendon."""
+    """Mark <muscle>s, and motors that can only shorten their tendon."""
     gain, gear = m.actuator_gainprm[:count, :9], m.actuator_gear[:count, 0]
     limited = m.actuator_ctrllimited[:count, None] != 0
     low, high = np.where(limited, m.actuator_ctrlrange[:count], (0.0, 1.0)).T

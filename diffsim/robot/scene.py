@@ -1,4 +1,4 @@
-"""Scene: the arrays the kernels read, and which features the scene uses."""
+"""Scene: the arrays that the kernels read, and the features that it uses."""
 
 from __future__ import annotations
 
@@ -29,24 +29,32 @@ FACTORS = (*PENALTY_CONSTANTS, "mass", "motor")
 
 
 class SceneError(ValueError):
-    """An MJCF file that is missing, broken, or holds something that is not simulated; names the element."""
+    """Raised for an MJCF file that is missing, broken or not supported; names the element."""
 
 
 class TerrainError(ValueError):
-    """A terrain that is none, or not for a robot."""
+    """Raised for an invalid terrain, or one that the robot cannot have."""
+
+
+class RootCoordinates(NamedTuple):
+    """The root's position as a function of qpos: the carrier's, see Scene.carrier."""
+
+    position: Array  # (3,) m, at qpos = 0
+    along: Array  # (nq,) the root's x is position[0] + along . qpos
+    up: Array  # (nq,) qpos + up is one metre higher; zero if no coordinate moves the root vertically
 
 
 class Spheres(NamedTuple):
-    """All that may touch the ground, in the frames of their links."""
+    """Spheres that may touch the ground, in the frames of their links."""
 
     link: Index  # (n,)
     centre: Array  # (n, 3)
     radius: Array  # (n,)
-    geom: Index  # (n,) what they are part of
+    geom: Index  # (n,) the geom that each stands for
 
 
 class Constraints(NamedTuple):
-    """Numbers of MuJoCo's constraints, for one length of a substep."""
+    """Parameters of MuJoCo's constraints, for one length of a substep."""
 
     # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
     # midpoint and power; margin [m]
@@ -148,24 +156,24 @@ class Scene:
 
     @property
     def qpos_adr(self) -> Index:
-        """(nlink,) where each link's joint is in qpos; the links of a ball joint point to its quaternion's w, x, y."""
+        """Return the index in qpos (nlink,) of each link's joint, w, x and y of its quaternion for a ball joint."""
         passed = np.concatenate([[0], np.cumsum(self.ball == 2)[:-1]])  # balls, each one number longer than its rates
         return (np.arange(self.nlink) - 1 + (7 if self.floating else 0) + passed).astype(np.int32)
 
     @property
     def quaternion_adr(self) -> Index:
-        """(number of quaternions,) where each begins in qpos."""
+        """Return the index in qpos of each quaternion's first number."""
         balls = self.qpos_adr[self.ball == 0]
         return np.concatenate([[3], balls]).astype(np.int32) if self.floating else balls
 
     @property
     def qpos0(self) -> Array:
-        """(nq,) the reference configuration of the MJCF."""
+        """Return the reference configuration (nq,) of the MJCF."""
         return np.array(self.mj_model.qpos0)
 
     @property
     def features(self) -> frozenset[str]:
-        """What this scene uses; the generated kernels hold nothing else."""
+        """Return the features that the scene uses; the generated kernels contain no others."""
         limited, constrained = np.isfinite(self.lower) | np.isfinite(self.upper), self.constraints is not None
         present = {
             "floating": self.floating,
@@ -189,10 +197,10 @@ class Scene:
 
     @property
     def carrier(self) -> int:
-        """The link that carries the origin of the spatial vectors, so that no digits are lost far from the world's.
+        """Return the link that carries the origin of spatial vectors, so that no digits are lost far from the world's.
 
-        The floating base itself; of a planar robot the end of the massless slides between it and the world, whose
-        motion is a pure translation of everything else; otherwise the fixed base.
+        It is the floating base, or the last of the massless slides between a planar robot and the world, whose motion
+        only translates everything else, or otherwise the fixed base.
         """
         link = 0
         while not self.floating and link + 1 < self.nlink and self.slide[link + 1]:
@@ -203,31 +211,30 @@ class Scene:
         return link
 
     @property
-    def root(self) -> tuple[Array, Array, Array]:
-        """Where the carrier is: at place (3,) [m] if qpos is 0, its x grows by along (nq,) . qpos, and qpos + up (nq,)
-        is one metre higher."""
-        place, frame, along, up = np.zeros(3), np.eye(3), np.zeros(self.nq), np.zeros(self.nq)
+    def root(self) -> RootCoordinates:
+        """Find the coordinates in qpos that move the root."""
+        position, frame, along, up = np.zeros(3), np.eye(3), np.zeros(self.nq), np.zeros(self.nq)
         if self.floating:
             along[0] = up[2] = 1.0
         for link in range(1, self.carrier + 1):  # slides, which turn nothing
-            place += frame @ (self.position[link] - self.joint_ref[link] * self.rotation[link] @ self.axis[link])
+            position += frame @ (self.position[link] - self.joint_ref[link] * self.rotation[link] @ self.axis[link])
             frame = frame @ self.rotation[link]
             axis = frame @ self.axis[link]
             along[link - 1] = axis[0]
             if abs(axis[2]) > 1 - 1e-9:
                 up[link - 1] = np.sign(axis[2])
-        return place, along, up
+        return RootCoordinates(position, along, up)
 
     @property
     def inert(self) -> int:
-        """Number of links after the fixed base without mass, contact or muscle: the slides of a planar robot."""
+        """Return the number of links after the fixed base without mass, contact or muscle: a planar robot's slides."""
         busy = (self.mass > 0) | self.inertia.any((1, 2))
         busy[[*self.contact_link, *self.segment_link.flatten()]] = True
         return 0 if self.floating else int((np.cumsum(busy[1:]) == 0).sum())
 
     @property
     def drag(self) -> tuple[Array, Array, Array, Array]:
-        """The fluid's drag on each link, MuJoCo's inertia-box law; see kernels/drag.py for its form.
+        """Compute the fluid's drag on each link by MuJoCo's inertia-box law; see kernels/drag.py for its form.
 
         Returns:
             principal axes (nlink, 3, 3) in the link's frame; the viscous coefficients (nlink, 3) of force and torque,
@@ -244,7 +251,7 @@ class Scene:
         return axes, viscous, force, torque
 
     def with_penalty(self, constants: Mapping[str, float]) -> Scene:
-        """A copy with some of PENALTY_CONSTANTS replaced, those of limits at every joint.
+        """Return a copy with some of PENALTY_CONSTANTS replaced, those of limits at every joint.
 
         Raises:
             ValueError: an unknown constant, or one that is negative or not finite.
@@ -260,7 +267,7 @@ class Scene:
         return dataclasses.replace(self, **changes)
 
     def with_terrain(self, vertices: ArrayLike) -> Scene:
-        """A copy whose ground is a profile z(x), the same at every y, in place of the plane.
+        """Return a copy whose ground is a profile z(x), the same at every y, instead of the plane.
 
         Args:
             vertices: (x, z) in the world [m], joined by straight segments whose first and last go on for ever:
@@ -277,7 +284,7 @@ class Scene:
 
 
 def _check_terrain(vertices: ArrayLike) -> Array:
-    """(M, K, 2) float64, M = 1 of a single profile."""
+    """Return profiles (M, K, 2) in float64, M = 1 for a single one; raises TerrainError if they are invalid."""
     try:
         profiles = np.array(vertices, dtype=np.float64)
     except (TypeError, ValueError) as error:

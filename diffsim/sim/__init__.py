@@ -1,1 +1,1 @@
-"""How a control step is taken: the batch of environments, its buffers in torch's graph, the launches of the kernels."""
+"""The simulator: a batch of environments, its buffers in torch's graph, the launches of the kernels."""

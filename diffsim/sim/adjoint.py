@@ -1,9 +1,9 @@
-"""Where gradients of single environments are heavy-tailed, one bad step outweighs a whole batch.
+"""Clip each environment's state gradient on the way back in time.
 
-Then the adjoint, the loss's gradient with respect to a state, is clipped in each environment on its way back in time,
-as recurrent networks clip it at each step (Graves 2013, https://arxiv.org/abs/1308.0850, section 2.1; Pascanu et al.
-2013, https://arxiv.org/abs/1211.5063, has the reasons), but to what is usual in the batch. By default nothing is
-clipped; docs/transfer.md shows what clipping does.
+If gradients of single environments are heavy-tailed, one bad step outweighs a whole batch. So the adjoint, the loss's
+gradient with respect to a state, can be clipped at each step, as in recurrent networks (Graves 2013,
+https://arxiv.org/abs/1308.0850, section 2.1; Pascanu et al. 2013, https://arxiv.org/abs/1211.5063), but to a multiple
+of the batch's median. By default nothing is clipped; docs/transfer.md shows the effect.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from torch import Tensor
 
 
 def row_scales(adjoint: Tensor, factor: float) -> Tensor:
-    """Scales (N, 1) in (0, 1] that bring the rows of adjoint (N, D) down to at most factor times their median norm.
+    """Return scales (N, 1) in (0, 1] that limit the rows of adjoint (N, D) to factor times their median norm.
 
-    The median is the lower one of the rows that are finite and not zero: contained environments have zeros. Rows that
-    are not finite keep their numbers, for the simulator to contain and count. The device is not waited for.
+    The median is the lower one of the rows that are finite and not zero: failed environments have zeros. Rows that are
+    not finite keep their numbers, for the simulator to contain and count. Nothing waits for the device.
     """
     norm = torch.linalg.vector_norm(adjoint, dim=1, keepdim=True, dtype=torch.float64)  # squares of float32 fit in it
     usual = norm.isfinite() & (norm > 0)
@@ -28,7 +28,7 @@ def row_scales(adjoint: Tensor, factor: float) -> Tensor:
 
 
 class ClipAdjoint(torch.autograd.Function):
-    """qpos (N, nq) and qvel (N, nv) as they are; their gradient, as one row for each environment, is clipped."""
+    """Passes qpos (N, nq) and qvel (N, nv) on, and clips their gradient, one row for each environment."""
 
     @staticmethod
     def forward(ctx: Any, factor: float, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ TOLERANCE = 1e-4  # as measured in docs/physics.md
 
 
 class Integration(NamedTuple):
-    """How the simulator takes a control step; docs/physics.md has the equations.
+    """Options of the integrator; docs/physics.md has the equations.
 
     Attributes:
         contact: "soft" (the SHAC paper's springs and dampers) or "mujoco" (MuJoCo's Euler and its own constraints for
@@ -45,12 +45,12 @@ def check_contact(contact: str) -> None:
 
 
 def is_real(value: object) -> TypeGuard[float]:
-    """Whether it is a number, be it NumPy's. True is none."""
+    """Tell whether it is a real number, of Python or NumPy; True is not."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def check_count(name: str, value: int, most: int = 2**63 - 1) -> int:
-    """The value as an int, be it NumPy's; raises ValueError unless it is an integer from 1 to `most`. True is none."""
+    """Return the value as an int; raises ValueError unless it is an integer from 1 to `most`, which True is not."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
     if value > most:

@@ -24,24 +24,24 @@ from diffsim.sim.options import BLOCKS, WARP_DTYPE, Options
 # thread it saves nothing. Blocks do five times as many meanwhile: with two threads 64 humanoids are faster, 64 ants are
 # not (results/cpu/speed_physics.csv).
 MIN_WORK_PER_THREAD, IN_BLOCKS = 4_000, 20_000
-# Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
+# Beyond this number of GPU threads each environment gets one: there are enough environments to fill the GPU.
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
 building = threading.RLock()  # Warp crashes where two threads make, compile or load kernels
 
 
 class TooLargeError(ValueError):
-    """What is asked for does not fit into the device's memory."""
+    """Raised when an allocation does not fit into the device's memory."""
 
 
 class Launcher:
     """Runs the forward and the backward kernel of a scene over a batch of environments.
 
-    On a CPU some threads take a share of the environments each; on a GPU a launch goes to torch's current stream.
+    On a CPU each thread takes a share of the environments; on a GPU a launch goes to torch's current stream.
 
     Attributes:
-        spec: what the kernels were generated for.
-        num_blocks: how many blocks of spec.block environments there are, the last of which may not be full.
+        spec: the specification of the kernels.
+        num_blocks: number of blocks of spec.block environments; the last one may not be full.
     """
 
     def __init__(self, scene: Scene, num_envs: int, options: Options) -> None:
@@ -78,10 +78,10 @@ class Launcher:
         bounds = [self.num_blocks * k // count for k in range(count + 1)]
         self._shares = list(zip(bounds, bounds[1:], strict=False))  # blocks of each thread: first, end
         self._pool: ThreadPoolExecutor | None = None
-        self._process = 0  # whose threads these are: a forked child has none of its parent's
+        self._process = 0  # that owns the threads: a forked child has none of its parent's
 
     def command(self, kernel: str, inputs: list[Any]) -> list[wp.Launch]:
-        """The launches of all shares with their arguments packed once: packing costs more than a small kernel."""
+        """Record the launches of all shares with their arguments: packing those costs more than a small kernel."""
         with building:
             startup.load(self._kernels[kernel].module, str(self.device), self._block_dim, self.scene.name)
             return [
@@ -97,7 +97,7 @@ class Launcher:
             ]
 
     def batch(self, parts: Iterable[torch.Tensor]) -> Any:
-        """The kernels' struct Batch, of its fields."""
+        """Make the kernels' struct Batch of its fields."""
         Batch = types(self.spec).Batch
         result = Batch()
         for name, part in zip(Batch.vars, parts, strict=True):
@@ -105,7 +105,7 @@ class Launcher:
         return result
 
     def launch(self, command: list[wp.Launch]) -> None:
-        """Runs a command; on a CPU returns when it is done."""
+        """Run a command; on a CPU return when it is done."""
         if self.device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
             with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
@@ -120,10 +120,10 @@ class Launcher:
             future.result()
 
     def checkpoints(self, count: int) -> Any:
-        """The kernels' struct Checkpoint, of `count` substeps.
+        """Allocate the kernels' struct Checkpoint for `count` substeps.
 
-        With MuJoCo's constraints also their acceleration and jar of all contacts there, and where damping follows them
-        the factors of both.
+        With MuJoCo's constraints it also holds the acceleration before damping and jar of all contacts, and the factors
+        of both solves if damping follows the constraints.
         """
         spec, n, result = self.spec, self.num_envs, types(self.spec).Checkpoint()
         accelerations = 2 * spec.nv + 3 * self.scene.ncontact if spec.constrained else spec.nv
@@ -140,7 +140,7 @@ class Launcher:
 
 
 def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
-    """(..., block) float32 values as an array of vectors, which to Warp are numbers of that dtype (kernels.wide)."""
+    """Wrap float32 values (..., block) as an array of vectors, which Warp takes for numbers of dtype (kernels.wide)."""
     strides = tuple(stride * values.itemsize for stride in values.stride()[:-1])
     array: Any = wp.array(ptr=values.data_ptr() or None, dtype=dtype, shape=values.shape[:-1], strides=strides)
     array.tensor = values  # keeps the memory
@@ -148,7 +148,7 @@ def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
 
 
 def default_division(scene: Scene, num_envs: int) -> Division:
-    """Of an environment among GPU threads: as measured in docs/performance.md."""
+    """Choose the division of an environment among GPU threads, as measured in docs/performance.md."""
     sharers = MUSCLE_SHARERS if "muscle" in scene.features else 1
     candidates = [divide(scene, groups * sharers, sharers) for groups in (1, 2, 4)]
     best = min(candidates, key=lambda division: (division.slots, division.threads_per_env))
@@ -156,19 +156,19 @@ def default_division(scene: Scene, num_envs: int) -> Division:
 
 
 def default_block(num_envs: int, options: Options) -> int:
-    """Of the numbers of environments that a thread can step at once, the fastest as measured in docs/performance.md."""
+    """Choose how many environments a thread steps at once, the fastest as measured in docs/performance.md."""
     if torch.device(options.device).type == "cuda" or options.dtype == torch.float64 or num_envs == 1:
         return 1
     return max(block for block in BLOCKS if block <= max(num_envs, 8))
 
 
 def available_cores() -> int:
-    """Cores that this process may run on."""
+    """Return the number of cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_memory(what: str, num_envs: int, bytes_each: int, device: torch.device) -> None:
-    """Raise TooLargeError if what is to be allocated, so many bytes per environment, is more than the device has."""
+    """Raise TooLargeError if an allocation of bytes_each per environment is more than the device has."""
     if device.type == "cuda":
         there = torch.cuda.get_device_properties(device).total_memory
     elif hasattr(os, "sysconf"):

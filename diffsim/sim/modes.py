@@ -1,4 +1,4 @@
-"""Modes of torch that the simulator and environments leave while they run."""
+"""Leave modes of torch that the simulator and environments do not run in."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Result = TypeVar("Result")
 
 
 def in_plain_mode(function: Callable[P, Result]) -> Callable[P, Result]:
-    """The function, which leaves torch.autocast, that would round what it computes to bfloat16, and inference_mode.
+    """Wrap a function so that it runs without torch.autocast, which would round to bfloat16, and inference_mode.
 
-    Tensors of inference_mode could not be trained from later: those made instead have no gradient either.
+    Tensors made in inference_mode could not be trained from later. Those made instead have no gradient either.
     """
 
     @functools.wraps(function)

@@ -1,4 +1,4 @@
-"""What a simulator can be asked for, and what of it is allowed."""
+"""Options of a simulator, and their checks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BLOCKS = (1, 8, 16)
 
 
 class Options(NamedTuple):
-    """How a scene is simulated, whatever the number of its copies.
+    """Options of a simulation that do not depend on num_envs.
 
     Attributes:
         integration: contact model and substeps.
@@ -38,7 +38,7 @@ class Options(NamedTuple):
     division: Division | None = None
 
     def check(self) -> Options:
-        """Itself, with plain types; raises ValueError, with what is allowed, if it cannot be simulated so."""
+        """Return itself with plain types; raises ValueError, with what is allowed, for an invalid field."""
         device, dtype = check_device(self.device), check_dtype(self.dtype)
         block = None if self.block is None else check_count("block", self.block)
         if block not in (None, *BLOCKS):
@@ -55,14 +55,14 @@ class Options(NamedTuple):
 
 
 def check_dtype(dtype: torch.dtype) -> torch.dtype:
-    """The dtype; raises ValueError unless the kernels have it."""
+    """Return the dtype; raises ValueError unless the kernels support it."""
     if dtype not in WARP_DTYPE:
         raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
     return dtype
 
 
 def check_device(device: str | torch.device) -> torch.device:
-    """The device, with an index if it is a GPU; raises ValueError unless it is the CPU or a GPU that is there."""
+    """Return the device, with an index if it is a GPU; raises ValueError unless it is the CPU or a present GPU."""
     try:
         result = torch.device("none" if device is None else device)  # torch takes None for its default device
     except (RuntimeError, TypeError):

@@ -18,10 +18,10 @@ from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options
 from diffsim.sim.tangent import Tangent
 
-DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # on MuJoCo's contact
+DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # that the constraints' adjoint divides by
 PASSES = 30  # of Newton's method in a substep, at most, as measured in docs/physics.md
-BACKWARD_ALONE = (
-    "a simulated step has derivatives by backward() and torch.autograd.grad alone, for one gradient at a time: no "
+BACKWARD_ONLY = (
+    "a simulated step supports backward() and torch.autograd.grad only, for one gradient at a time: no "
     "torch.func, forward mode or is_grads_batched; Simulator.jacobians has the Jacobians of a batch"
 )
 State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
@@ -112,22 +112,22 @@ class Simulator:
 
     @functools.cached_property
     def tangent(self) -> Tangent:
-        """Of differences between its scene's states."""
+        """Return the tangent space of its scene's states."""
         return Tangent(self.scene, self.device, self.dtype)
 
     @property
     def nonfinite(self) -> torch.Tensor:
-        """(N,) bool: environments whose last step was not finite or out of bounds, and was undone. See the class."""
+        """Return (N,) bool, true if the last step was not finite or out of bounds, and was undone; see the class."""
         return self._nonfinite[self._last]
 
     @property
     def residual(self) -> torch.Tensor:
-        """(N,) largest residual of Newton's method among the substeps of the last step; zeros on soft contact."""
+        """Return (N,) the largest residual of Newton's method in the last step's substeps; zeros on soft contact."""
         return self._end[:, self.nq + self.nv :].sum(1)
 
     @property
     def factors(self) -> torch.Tensor:
-        """(N, 8) multipliers of constants, columns as in scene.FACTORS; (N, 0) without factors=True. See the class."""
+        """Return multipliers (N, 8) of constants, columns as in scene.FACTORS; (N, 0) without factors=True."""
         return self._factors
 
     @factors.setter
@@ -136,7 +136,7 @@ class Simulator:
 
     @property
     def forces(self) -> torch.Tensor:
-        """(N, nbody, 6) external force [N] and torque [N m] on each body, world axes; (N, 0, 6) without forces=True."""
+        """Return force [N] and torque [N m] (N, nbody, 6) on each body, world axes; (N, 0, 6) without forces=True."""
         return self._forces
 
     @forces.setter
@@ -165,8 +165,8 @@ class Simulator:
         return self.advance(qpos, qvel, ctrl)
 
     def advance(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        """`step` without checks of shape, dtype and device."""
-        if self.device.type == "cpu":  # a GPU's would have to be waited for
+        """Do what `step` does, without checks of shape, dtype and device."""
+        if self.device.type == "cpu":  # on a GPU the check would wait for the device
             for name, given in (("factors", self._factors), ("forces", self._forces)):
                 if given.shape[1]:
                     self._check_given(name, given, *given.shape[1:])
@@ -186,7 +186,7 @@ class Simulator:
         return end
 
     def _forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
-        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl, factors, forces)."""
+        """Return the state (N, nq + nv) after one control step from start = (qpos, qvel, ctrl, factors, forces)."""
         torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
         self._last = slot
         self._launcher.launch(self._command("forward", slot))
@@ -196,7 +196,7 @@ class Simulator:
     def jacobians(
         self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """A (N, 2 nv, 2 nv) and B (N, 2 nv, nu) of one control step: dx' = A dx + B dctrl, by 2 nv backward passes.
+        """Compute A (N, 2 nv, 2 nv) and B (N, 2 nv, nu) of a step: dx' = A dx + B dctrl, in 2 nv backward passes.
 
         x is qpos, then qvel, and differences of qpos are those of MuJoCo's mjd_transitionFD: a rotation changes by a
         rotation vector in the body's frame. Arguments, factors and forces are as for `step`. It takes the place of the
@@ -258,7 +258,7 @@ class Simulator:
             raise ValueError(f"{name} is {have}, must be a torch.Tensor of {must}")
 
     def _check_given(self, name: str, value: torch.Tensor, *size: int) -> torch.Tensor:
-        """Factors or forces; raises ValueError unless they are finite, and factors not negative, divisors positive."""
+        """Raise ValueError unless factors or forces are finite, and factors not negative, divisors positive."""
         self.check_tensor(name, value, *size)
         bad = ~torch.isfinite(value)
         if name == "factors":
@@ -276,11 +276,11 @@ class Simulator:
 def refuse_transforms(value: torch.Tensor) -> None:
     """Raise RuntimeError under a transform of torch.func, and for a tangent of forward mode: no kernel sees either."""
     if torch._C._are_functorch_transforms_active() or unpack_dual(value).tangent is not None:
-        raise RuntimeError(BACKWARD_ALONE)
+        raise RuntimeError(BACKWARD_ONLY)
 
 
 class ControlStep(torch.autograd.Function):
-    """qpos, qvel, ctrl, factors, forces -> qpos and qvel side by side. The simulator's slot keeps them for backward."""
+    """Maps qpos, qvel, ctrl, factors, forces to qpos and qvel side by side; a slot keeps the arguments."""
 
     @staticmethod
     def forward(ctx: Any, sim: Simulator, slot: int, *start: torch.Tensor) -> torch.Tensor:
@@ -303,6 +303,6 @@ class ControlStep(torch.autograd.Function):
         try:
             sim._g_end.copy_(g_end)
         except RuntimeError as error:  # is_grads_batched
-            raise RuntimeError(BACKWARD_ALONE) from error
+            raise RuntimeError(BACKWARD_ONLY) from error
         sim._launcher.launch(sim._command("backward", ctx.slot))
         return (None, None, *sim._g_start.clone().split(sim._widths, dim=1))

@@ -15,7 +15,7 @@ class Tangent:
     MuJoCo differentiates (mj_differentiatePos, mjd_transitionFD). All other numbers are their own.
 
     Attributes:
-        quaternions: where each begins in qpos, and where its rotation vector does in the degrees of freedom.
+        quaternions: first index of each in qpos, and of its rotation vector in the degrees of freedom.
     """
 
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
@@ -29,7 +29,7 @@ class Tangent:
         self._flat[rows, columns] = 1.0
 
     def basis(self, x: Tensor) -> Tensor:
-        """(..., nx, nd) how x moves along each coordinate of a tangent vector."""
+        """Return the derivative (..., nx, nd) of x along each coordinate of a tangent vector."""
         basis = self._flat.expand(*x.shape[:-1], *self._flat.shape)
         if self.quaternions:
             basis = basis.clone()
@@ -40,7 +40,7 @@ class Tangent:
         return basis
 
     def left_inverse(self, x: Tensor) -> Tensor:
-        """(..., nd, nx) of the basis, for quaternions of unit length."""
+        """Return the left inverse (..., nd, nx) of the basis, for quaternions of unit length."""
         inverse = self.basis(x).mT
         for _, d in self.quaternions:
             inverse[..., d : d + 3, :] *= 4.0

@@ -66,7 +66,7 @@ def find_task(name: str | type[Task]) -> type[Task]:
     base, options = base_name(str(name)), str(name).partition(":")[2]
     if base not in TASKS:
         raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
-    return _restored.get(name) or (TASKS[base].configured(options) if options else TASKS[base])
+    return _restored.get(name) or (TASKS[base] if name == base else TASKS[base].configured(options))
 
 
 def restore_task(name: str, stored: dict[str, object]) -> None:

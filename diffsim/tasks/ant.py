@@ -24,5 +24,5 @@ class Ant(Locomotion):
     sides = (("_1", "_4"), ("_2", "_3"))
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Eq. 19: R_v + 0.1 R_up + R_heading + R_height, R_height = h - 0.27."""
+        """Return Eq. 19: R_v + 0.1 R_up + R_heading + R_height, R_height = h - 0.27."""
         return self.progress(obs) + (obs[..., 0] - 0.27)

@@ -1,4 +1,4 @@
-"""What a task is: where its robot is, how an episode starts, what is observed and rewarded, and when it ends.
+"""Task: a robot, its start states, its observation, its reward, and the end of its episodes.
 
 The methods are differentiable torch on batches of any leading shape; they make no tensor from Python data and never
 wait for the device, so they can be captured into a CUDA graph. Equations and tables are those of the SHAC paper (Xu et
@@ -31,13 +31,13 @@ from diffsim.sim.integration import TOLERANCE, Contact, Integration, check_conta
 Accuracy = Literal["fast", "default", "accurate"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
-OPTIONS = "diffsim.extra.variation:configure"  # what reads options after a task's name
-LIKENESS = 0.9  # of a misspelt name, by difflib's measure
+OPTIONS = "diffsim.extra.variation:configure"  # reads options after a task's name
+LIKENESS = 0.9  # difflib ratio above which a name counts as misspelt
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
 class TaskError(ValueError):
-    """There is no such task, or it does not fit its robot. The message is one line that says all."""
+    """Raised for an unknown task, or one that does not fit its robot, with a message of one line."""
 
 
 class Task:
@@ -77,8 +77,11 @@ class Task:
 
     @classmethod
     def load_robot(cls) -> Scene:
-        """The robot of the asset. A file of diffsim's tasks is in diffsim/assets; another's is sought next to the file
-        of the class that names it, in the working directory and in diffsim/assets."""
+        """Load the robot of the asset.
+
+        A file of diffsim's tasks is in diffsim/assets. Another task's is searched next to the file of the class that
+        names it, in the working directory and in diffsim/assets.
+        """
         owner = next((kind for kind in cls.__mro__ if "asset" in vars(kind)), cls).__module__
         asset: Asset | None = getattr(cls, "asset", None)
         if asset is None:
@@ -93,12 +96,12 @@ class Task:
         raise TaskError(f"task {cls.name!r}: no robot file {str(asset)!r} in {' or '.join(map(str, folders))}")
 
     def scene(self) -> Scene:
-        """The robot as this task drives it; by default that of `load_robot`."""
+        """Return the robot as this task drives it; by default that of `load_robot`."""
         return self.load_robot()
 
     @torch.no_grad()
     def bind(self, scene: Scene) -> Task:
-        """Itself, fitted to its robot: start, num_random, obs_dim and forward_column are found where they are missing.
+        """Fit the task to its robot and return it: find missing start, num_random, obs_dim and forward_column.
 
         Raises:
             TaskError: a name, a number or what a method returns does not fit; an episode is over where it starts.
@@ -141,7 +144,7 @@ class Task:
         return self
 
     def _tensor(self, method: str, value: Tensor) -> Tensor:
-        """What a method returns for the start."""
+        """Return a method's result for the start; raises TaskError unless it is a finite tensor."""
         if not isinstance(value, Tensor):
             raise TaskError(f"task {self.name!r}: {method} returns {type(value).__name__}, must return a torch tensor")
         if not value.isfinite().all():
@@ -153,7 +156,7 @@ class Task:
             raise TaskError(f"task {self.name!r}: {name} is {value}, must be {expected}{source and f' ({source})'}")
 
     def _check_names(self) -> None:
-        """That a class outside this package has the methods that it needs, and none of Task's names misspelt."""
+        """Check that a class outside this package has the required methods, and none of Task's names misspelt."""
         own = {name for kind in type(self).__mro__ if not kind.__module__.startswith("diffsim.") for name in vars(kind)}
         known = {name for name in (*vars(Task), *Task.__annotations__) if not name.startswith("_")}
         for name in sorted(own - known):
@@ -166,7 +169,7 @@ class Task:
                 raise TaskError(f"task {self.name!r} has no method {names[0]!r}")
 
     def _check_attributes(self, nq: int) -> None:
-        """That those can be used which would otherwise fail when a run has begun."""
+        """Check attributes that would otherwise fail during a run."""
         name, length, height, column = self.name, self.episode_length, self.min_height, self.forward_column
         whole, numbered = (isinstance(value, Integral) and is_real(value) for value in (length, column))
         found = column is None or (numbered and column in range(nq))
@@ -182,7 +185,7 @@ class Task:
 
     @classmethod
     def presets(cls, contact: str | None = None) -> dict[str, Integration]:
-        """The presets "fast", "default" (the paper's) and "accurate" that it has on a contact model, its own if None.
+        """Return its presets "fast", "default" (the paper's) and "accurate" on a contact model, its own if None.
 
         "accurate" has four times the substeps of "default", and errs a quarter. There is no "fast" on MuJoCo's contact:
         what saves much time there errs too much (docs/numerics.md).
@@ -202,7 +205,7 @@ class Task:
 
     @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
-        """One of the presets.
+        """Return one of the presets.
 
         Raises:
             ValueError: another name, or a preset that the task has not.
@@ -215,19 +218,19 @@ class Task:
 
     @classmethod
     def falls(cls) -> bool:
-        """Whether episodes end where the robot falls, not only by time."""
+        """Tell whether episodes end when the robot falls, not only by time."""
         return cls.min_height is not None or cls.terminated is not Task.terminated
 
     @classmethod
     def has_mirror(cls) -> bool:
-        """Whether the task has a mirror image."""
+        """Tell whether the task has a mirror image."""
         return cls.mirrored_by is not None
 
     @cached_property
     def mirror(self) -> Any:
-        """How the task looks with left and right exchanged, see extra/mirror.py; raises ValueError if it has no image.
+        """Return the task's mirror image, left and right exchanged (extra/mirror.py); raises ValueError if it has none.
 
-        It is made when first asked for, which a CUDA graph cannot capture, so ask before.
+        It is made at the first call, which a CUDA graph cannot capture.
         """
         if self.mirrored_by is None:
             raise ValueError(f"task {self.name!r} has no mirror image")
@@ -255,7 +258,7 @@ class Task:
         raise NotImplementedError
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
-        """Start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).
+        """Draw start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).
 
         rand = 0.5 everywhere gives the unperturbed start.
         """
@@ -265,7 +268,7 @@ class Task:
         return drawn[..., : self._nq], drawn[..., self._nq :]
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """Observation (..., obs_dim) of qpos (..., nq) and qvel (..., nv).
+        """Return the observation (..., obs_dim) of qpos (..., nq) and qvel (..., nv).
 
         action (..., nu) is the one that led there, clipped to [-1, 1]; zeros at the start of an episode. Raises a
         NotImplementedError if the task's observation depends on its memory.
@@ -273,11 +276,11 @@ class Task:
         raise NotImplementedError(f"an observation of task {self.name!r} depends on its memory: use observe_with")
 
     def begin(self, rand: Tensor) -> Tensor:
-        """The memory (..., num_memory) at the start of an episode from rand (..., num_random); none by default."""
+        """Return the memory (..., num_memory) at an episode's start from rand (..., num_random); empty by default."""
         return rand[..., :0]
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
-        """The memory (..., num_memory) after a control step.
+        """Return the memory (..., num_memory) after a control step.
 
         Args:
             memory: (..., num_memory) before it; gradients flow through it within a window.
@@ -287,35 +290,35 @@ class Task:
         return memory
 
     def ghost(self, memory: Tensor) -> Tensor | None:
-        """World qpos (..., nq) of what the robot is to track, which films and pages draw next to it, or None."""
+        """Return the world qpos (..., nq) that the robot should track, for videos and pages, or None."""
         return None
 
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """The qvel (..., nv) and action (..., nu) that a control step takes instead of these: pushes, delays.
+        """Apply pushes and delays to qvel (..., nv) and action (..., nu) before a control step.
 
         memory: (..., num_memory) before the step.
         """
         return qvel, action
 
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
-        """`observe`, with the memory (..., num_memory) after the step."""
+        """Do what `observe` does, given the memory (..., num_memory) after the step."""
         return self.observe(qpos, qvel, action)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Reward (...) of action (..., nu), clipped to [-1, 1], which led to obs (..., obs_dim)."""
+        """Return the reward (...) of action (..., nu), clipped to [-1, 1], which led to obs (..., obs_dim)."""
         raise NotImplementedError
 
     def terminated(self, obs: Tensor) -> Tensor:
-        """bool (...), true where the episode ends because the robot has fallen or the task is over."""
+        """Return bool (...), true where the robot has fallen or the task is over."""
         return self.over(obs) if self.min_height is None else obs[..., 0] < self.min_height
 
     def over(self, obs: Tensor) -> Tensor:
-        """Whether there is nothing more to do, so that an episode ends without early termination, too: bool (...)."""
+        """Return bool (...), true where the task is finished, which ends episodes without early termination, too."""
         return torch.zeros_like(obs[..., 0], dtype=torch.bool)
 
 
 class Planar(Task):
-    """A robot of hinges and slides: observed is all of its state but where it is, the first `places` of qpos.
+    """A robot of hinges and slides; it observes its state except its position, the first `places` of qpos.
 
     Tables 7 and 8: height and pitch (or yaw), joints, then the rates of x, height (or y), pitch and joints.
     """
@@ -327,12 +330,14 @@ class Planar(Task):
 
 
 def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:
-    """R_height of Eqs. 16-17 and 21-22: with D = clip(delta, -1, upper) [m], -200 D^2 below zero and slope D above."""
+    """Return R_height, Eqs. 16-17, 21-22: with D = clip(delta, -1, upper) [m], -200 D^2 below zero, slope D above."""
     return slope * delta.clamp(0.0, upper) - 200.0 * delta.clamp(-1.0, 0.0).square()
 
 
 def way_forward(scene: Scene) -> int | None:
-    """Column of qpos that is the root's x, of its free joint or its slide along x; None if neither ground nor fluid
-    carries the robot, or if it has no such joint, as an arm."""
-    found = np.flatnonzero(scene.root[1] > 0.99)
+    """Return the column of qpos that is the root's x, of its free joint or its slide along x.
+
+    None if the robot has no such joint, as an arm, or if neither ground nor fluid moves it forward.
+    """
+    found = np.flatnonzero(scene.root.along > 0.99)
     return int(found[0]) if len(found) and scene.features & {"contact", "drag"} else None

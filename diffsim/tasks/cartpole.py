@@ -29,12 +29,12 @@ class CartPole(Task):
         self._cost = torch.tensor((0.05, 0.1, 0.0, 0.0, 0.1), device=device, dtype=dtype)
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """Table 6: x, x', sin theta, cos theta, theta'."""
+        """Return Table 6: x, x', sin theta, cos theta, theta'."""
         x, theta = qpos.split(1, dim=-1)
         x_dot, theta_dot = qvel.split(1, dim=-1)
         return torch.cat((x, x_dot, theta.sin(), theta.cos(), theta_dot), dim=-1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Eq. 13: -theta^2 - 0.1 theta'^2 - 0.05 x^2 - 0.1 x'^2, theta in [-pi, pi]."""
+        """Return Eq. 13: -theta^2 - 0.1 theta'^2 - 0.05 x^2 - 0.1 x'^2, theta in [-pi, pi]."""
         theta = torch.atan2(obs[..., 2], obs[..., 3])
         return -theta.square() - (obs.square() * self._cost).sum(-1)

@@ -21,5 +21,5 @@ class HalfCheetah(Planar):
     spread = (0.2,) * 9 + (0.5,) * 9
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Eq. 14: v_x - 0.1 |a|^2."""
+        """Return Eq. 14: v_x - 0.1 |a|^2."""
         return obs[..., 8] - 0.1 * action.square().sum(-1)

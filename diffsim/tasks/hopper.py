@@ -24,7 +24,7 @@ class Hopper(Planar):
     spread = (0.1,) * 12
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Eq. 15: R_v + R_height + R_angle - 0.1 |a|^2."""
+        """Return Eq. 15: R_v + R_height + R_angle - 0.1 |a|^2."""
         height, pitch, forward = obs[..., 0], obs[..., 1], obs[..., 5]
         angle = 1.0 - (pitch / (math.pi / 6)).square()  # Eq. 18
         return forward + height_reward(height + 0.3, upper=0.3, slope=1.0) + angle - 0.1 * action.square().sum(-1)

@@ -25,6 +25,6 @@ class Humanoid(Locomotion):
     sides = (("right_", "left_"),)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Eq. 20: R_v + 0.1 R_up + R_heading + R_height - 0.002 |a|^2, R_height of Eqs. 21-22."""
+        """Return Eq. 20: R_v + 0.1 R_up + R_heading + R_height - 0.002 |a|^2, R_height of Eqs. 21-22."""
         height = height_reward(obs[..., 0] - 0.84, upper=0.1, slope=10.0)
         return self.progress(obs) + height - 0.002 * action.square().sum(-1)

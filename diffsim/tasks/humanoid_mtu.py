@@ -31,6 +31,6 @@ class HumanoidMTU(Locomotion):
     sides = (("R_", "L_"), ("R", "L"))
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Eq. 23: R_v + 0.1 R_up + R_heading + R_height - 0.001 |a|^2, a the activations; R_height of Eqs. 24-25."""
+        """Return Eq. 23: R_v + 0.1 R_up + R_heading + R_height - 0.001 |a|^2, a activations, R_height of Eqs. 24-25."""
         height = height_reward(obs[..., 0] - 0.51, upper=0.05, slope=4.0)
         return self.progress(obs) + height - 0.001 * (0.5 * action + 0.5).square().sum(-1)

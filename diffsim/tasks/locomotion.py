@@ -1,4 +1,4 @@
-"""What ant and the humanoids share: a robot with a free root that runs along x. Appendix A.3.4 to A.3.6."""
+"""Locomotion: a robot with a free root runs along x, as ant and the humanoids do. Appendix A.3.4 to A.3.6."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORWARD_VELOCITY = 5  # column of the observation: v_x
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
-    """Turns vector (..., 3) by the unit quaternion wxyz (..., 4): v + 2 w (u x v) + 2 u x (u x v), broadcasting."""
+    """Rotate vector (..., 3) by the unit quaternion wxyz (..., 4): v + 2 w (u x v) + 2 u x (u x v), broadcasting."""
     w, u = quat.split((1, 3), dim=-1)
     t = 2.0 * torch.linalg.cross(u, vector)
     return torch.addcmul(vector, w, t) + torch.linalg.cross(u, t)
@@ -50,7 +50,7 @@ class Locomotion(Task):
         self._progress[FORWARD_VELOCITY], self._progress[up], self._progress[up + 1] = 1.0, 0.1, 1.0
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
-        """Start states from rand, see Task. The root is turned by up to 7.5 degrees about a random axis."""
+        """Draw start states from rand, see Task. The root is rotated by up to 7.5 degrees about a random axis."""
         drawn = torch.addcmul(self._start, rand - 0.5, self._spread)
         position, angle, axis, joints, angular, linear, rates = drawn.split(self._drawn, dim=-1)
         w, u = torch.cos(0.5 * angle), torch.sin(0.5 * angle) * F.normalize(axis, dim=-1)
@@ -60,8 +60,11 @@ class Locomotion(Task):
         return torch.cat((position, w, u, joints), dim=-1), torch.cat((velocity, angular, rates), dim=-1)
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """Tables 9 to 11, vectors in the world frame: height, quaternion xyzw, linear and angular velocity, joints,
-        0.1 joint rates, the body's z axis along up, its x axis along the way to the target, action (if observed)."""
+        """Return the observation of Tables 9 to 11, vectors in the world frame.
+
+        height, quaternion xyzw, linear and angular velocity, joints, 0.1 joint rates, projection of the body's z axis
+        on up and of its x axis on the direction to the target, action (if observed).
+        """
         position, quat, joints = qpos.split((3, 4, qpos.shape[-1] - 7), dim=-1)
         velocity, angular, rates = qvel.split((3, 3, qvel.shape[-1] - 6), dim=-1)
         body = torch.cat((angular.unsqueeze(-2), self._axes.expand(*angular.shape[:-1], 2, 3)), dim=-2)
@@ -76,5 +79,5 @@ class Locomotion(Task):
         return torch.cat((*seen, action) if self.observe_action else seen, dim=-1)
 
     def progress(self, obs: Tensor) -> Tensor:
-        """R_v + 0.1 R_up + R_heading of Eqs. 19, 20 and 23 (...)."""
+        """Return R_v + 0.1 R_up + R_heading (...) of Eqs. 19, 20 and 23."""
         return (obs * self._progress).sum(-1)

@@ -17,7 +17,7 @@ from torch import nn
 from diffsim.env import DiffEnv
 from diffsim.tasks import FILE, TASKS, base_name, restore_task
 from diffsim.training.errors import fail
-from diffsim.training.layers import Both, First, Fold, Likeliest, ObsNormalizer
+from diffsim.training.layers import First, Likeliest, MirrorMean, ObsNormalizer, WithMirrorImage
 
 POLICIES = Path(__file__).resolve().parents[1] / "policies"  # that come with the package
 FORMAT = 2
@@ -26,18 +26,18 @@ HOME = "diffsim"  # the simulator in which policies are trained, unless a checkp
 
 # What a policy may consist of, and the attributes that its constructor takes.
 LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
-    "Both": (Both, ("size",)),
     "ELU": (nn.ELU, ()),
     "First": (First, ("columns",)),
-    "Fold": (Fold, ("size",)),
     "LayerNorm": (nn.LayerNorm, ("normalized_shape",)),
     "Likeliest": (Likeliest, ("actions", "components", "shared")),
     "Linear": (nn.Linear, ("in_features", "out_features")),
+    "MirrorMean": (MirrorMean, ("size",)),
     "ObsNormalizer": (ObsNormalizer, ("size",)),
     "ReLU": (nn.ReLU, ()),
     "SiLU": (nn.SiLU, ()),
     "Softplus": (nn.Softplus, ()),
     "Tanh": (nn.Tanh, ()),
+    "WithMirrorImage": (WithMirrorImage, ("size",)),
 }
 
 

@@ -31,8 +31,8 @@ FILM = "diffsim.extra.render:film"
 GAIT = "diffsim.extra.gait:report"
 VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
-FINER = 4  # times the substeps, without --implicit: a return counts only if it survives this finer integration
-ENOUGH = 0.97  # of the return, kept there
+FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit; 0: not checked
+ENOUGH = 0.97  # share of the return that must survive
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 
@@ -214,10 +214,7 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
 
 
 def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | None = None) -> None:
-    """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video.
-
-    Unless --no-finer is given, the policy must also keep its return at FINER times the substeps, without --implicit:
-    one that does not has learned to live on the integrator's errors.
+    """Do what --evaluate asks for: print the evaluation of a saved policy, and write evaluation.json.
 
     Args:
         args: the script's arguments.
@@ -235,20 +232,34 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
         checkpoint.restore(restored := learner(flags, env), state)
         return restored.evaluate()
 
-    evaluation, found = measure(args), dict[str, Any]()
+    evaluation = measure(args)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    if args.finer:
-        substeps = FINER * args.substeps
-        value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
-        share = kept(evaluation.returns.median().item(), value)
-        found["finer"] = {"substeps": substeps, "return": value, "kept": share}
-        warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-        say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{warning}")
-    write_evaluation(args, evaluation, state["iteration"], **found)
+    write_evaluation(args, evaluation, state["iteration"], **compare_finer(args, evaluation, measure))
+
+
+def compare_finer(args: Args, evaluation: Evaluation, measure: Callable[[Args], Evaluation]) -> dict[str, Any]:
+    """Print how much of its return a policy keeps at FINER times the substeps, without --implicit.
+
+    One that keeps less than ENOUGH has learned to exploit the integrator's errors.
+
+    Args:
+        measure: evaluates the policy with other arguments.
+
+    Returns:
+        for evaluation.json: the finer substeps, the return there and the share that is kept.
+    """
+    if not FINER:
+        return {}
+    substeps = FINER * args.substeps
+    value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
+    share = kept(evaluation.returns.median().item(), value)
+    warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
+    say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{warning}")
+    return {"finer": {"substeps": substeps, "return": value, "kept": share}}
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
-    """Leave evaluation.json in the run's directory, and print and leave how the robot walks."""
+    """Write evaluation.json to the run's directory; print and write how the robot walks."""
     assert args.run_dir
     settings = {name: value for name, value in vars(args).items() if name in SETTINGS}
     settings |= dict(script=args.script(), iteration=iteration)

@@ -14,12 +14,12 @@ import tyro
 from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, in_one_line
-from diffsim.training.ranges import Count, Natural, NonNegative, Range, Repeats, check_ranges, flag
+from diffsim.training.ranges import Count, Natural, Range, check_ranges, flag
 
 FIXED = ("env", "seed", "num_envs", "control_dt")  # with --resume; what else must fit, `restore` tells
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
-OPTIONS = {*"contact accuracy substeps implicit early_termination control_dt".split()}
-EVALUATED = OPTIONS - {"control_dt"} | {*"device eval_episodes evaluate finer quiet run_dir threads".split()}
+OPTIONS = {*"contact accuracy substeps implicit control_dt".split()}
+EVALUATED = OPTIONS - {"control_dt"} | {*"device eval_episodes evaluate quiet run_dir threads".split()}
 ENV = (
     f"task: {', '.join(TASKS)}, with options as in go2:rough=20 or g1_track:walk.npz (docs/tasks.md); "
     "or a file of your own, my_task.py or my_task.py:Class (docs/own_robot.md)"
@@ -29,10 +29,11 @@ Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**
 
 @dataclass
 class Flags:
-    """What every script takes: the run, the task, and how it is simulated. Each extends it by its hyperparameters."""
+    """Flags of every script: the run, the task, and how it is simulated. Each script adds its hyperparameters."""
 
     fixed: ClassVar[tuple[str, ...]] = ()  # flags of a script that --resume keeps
 
+    env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
     seed: Seed = 1
     """seed of all random numbers"""
     iterations: Count = 2000
@@ -42,24 +43,19 @@ class Flags:
     run_dir: Path | None = None
     """directory of the run (default: a new runs/{env}__{script}__{seed}__{time}, or the resumed checkpoint's)"""
     eval_every: Natural = 200
-    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
+    """evaluate the policy without noise every this many iterations (0: only at the end)"""
     eval_episodes: Count = 64
     """episodes of an evaluation, each in its own environment"""
     save_every: Natural = 100
     """save the checkpoint every this many iterations (0: only at the end)"""
-    stop_after: Natural = 0
-    """stop and save at this iteration, as Ctrl-C would; schedules still run to --iterations (0: do not stop)"""
     resume: Path | None = None
     """checkpoint, or directory of a run, to continue with its arguments unless the command line gives others"""
     evaluate: Path | None = None
     """checkpoint, or directory of a run, to evaluate, e.g. with more --substeps; writes evaluation.json to --run-dir"""
-    finer: bool = True
-    """with --evaluate, also measure the return at four times the substeps, without --implicit"""
     track: bool = False
     """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
     """no progress bar, and no messages until the end"""
-    env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
     contact: Contact = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
     accuracy: Accuracy = "default"
@@ -68,86 +64,38 @@ class Flags:
     """simulation steps per control step (per task, --contact and --accuracy)"""
     implicit: bool = False
     """on soft contact, damping and friction act at the end of a substep (per task and --accuracy)"""
-    early_termination: bool = True
-    """end episodes when the robot falls; otherwise they end only by time"""
     threads: Natural = 0
     """CPU threads of the simulator; they do not change results (0: chosen by the amount of work)"""
 
+    @property
+    def task(self) -> str:
+        """The task's name without options: tables of defaults are by it."""
+        return base_name(self.env)
+
     def task_defaults(self) -> dict[str, Any]:
-        """Defaults that depend on other flags, such as the task, the device or the preset."""
+        """Return defaults that depend on other flags, such as the task, the device or the preset."""
         return {}
 
     def check(self) -> None:
-        """Raises a ValueError where arguments do not fit together."""
+        """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""
         if self.contact == "mujoco" and self.implicit:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
+        if (num_envs := getattr(self, "num_envs", 0)) % distributed.size():
+            fail(f"--num-envs {num_envs} cannot be split evenly among {distributed.size()} processes")
+        if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
+            fail(f"--symmetric: task {self.env!r} has no mirror image")
 
     @classmethod
     def script(cls) -> str:
-        """Name of the script that declares the class, without .py."""
+        """Name the script that declares the class, without .py."""
         return Path(str(sys.modules[cls.__module__].__file__)).stem
-
-
-@dataclass
-class ParallelFlags(Flags):
-    """Many environments at once."""
-
-    num_envs: Count = 64
-    """parallel environments N, over all processes of torchrun (per task)"""
-    cuda_graph: bool = True
-    """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
-    monitor: Natural = 50
-    """iterations between replays of 32 steps with 4 times the substeps (sim/state_error, sim/return_lost); 0: none"""
-
-    def check(self) -> None:
-        super().check()
-        if self.num_envs % distributed.size():
-            fail(f"--num-envs {self.num_envs} cannot be split evenly among {distributed.size()} processes")
-
-
-@dataclass
-class SymmetricFlags(ParallelFlags):
-    """Flags of learners that can treat left and right alike."""
-
-    symmetric: bool = False
-    """treat left and right alike: a mirrored state gets the mirrored action (per task; docs/sapo.md)"""
-
-    def task_defaults(self) -> dict[str, Any]:
-        return super().task_defaults() | {"symmetric": find_task(self.env).symmetric}
-
-    def check(self) -> None:
-        super().check()
-        if self.symmetric and not find_task(self.env).has_mirror():
-            fail(f"--symmetric: task {self.env!r} has no mirror image")
-
-
-@dataclass
-class WindowFlags(SymmetricFlags):
-    """Flags of learners that descend the gradient of short rollouts."""
-
-    adjoint_clip: NonNegative = 0.0
-    """clip gradients with respect to a state to this many times the batch's median (0: do not clip)"""
-    horizon: Count = 32
-    """control steps h of a rollout (per task)"""
-    critic_minibatches: Repeats = 4
-    """minibatches of a pass over a rollout's samples, contiguous in time"""
-
-    @property
-    def samples(self) -> int:
-        """Of a rollout, for each critic."""
-        return self.num_envs * self.horizon // distributed.size()
-
-    def check(self) -> None:
-        super().check()
-        if self.critic_minibatches > (most := self.samples):
-            fail(f"--critic-minibatches {self.critic_minibatches} are more than the {most} samples of a rollout")
 
 
 Args = TypeVar("Args", bound=Flags)
 
 
 def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
-    """The command line as complete, checked arguments.
+    """Parse a command line into complete, checked arguments.
 
     Defaults that depend on the task, its preset and the device fill what is not given. With --resume and --evaluate
     the arguments of the checkpoint take their place.
@@ -174,14 +122,14 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
         args = _cli(kind, argv, defaults)
     check_ranges(args)
-    (Flags.check if args.evaluate else kind.check)(args)  # no training that was allowed forbids an evaluation
+    (Flags.check if args.evaluate else kind.check)(args)  # an evaluation skips checks that concern training
     if path and args.run_dir is None:
         args.run_dir = path.parent
     return args
 
 
 def _presets(args: Flags) -> dict[str, Any]:
-    """What --accuracy and --contact stand for."""
+    """Look up what --accuracy and --contact stand for."""
     try:
         how = find_task(args.env).integration(args.accuracy, args.contact)
     except ValueError as error:
@@ -190,7 +138,7 @@ def _presets(args: Flags) -> dict[str, Any]:
 
 
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:
-    """The arguments of --resume or --evaluate: the checkpoint's, then the command line's."""
+    """Parse a command line with --resume or --evaluate, whose defaults are the checkpoint's arguments."""
     saved = checkpoint.load(path, kind.script())
     if given.resume and "modules" not in saved:
         fail(f"{path} holds only a policy, which can be evaluated but not resumed")
@@ -222,9 +170,8 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         if own != wanted and not (name == "env" and base_name(own) == base_name(wanted)):
             fail(f"{path} has {flag(name)} {own}, which cannot change to {wanted}{may}")
     if args.resume:
-        last = min(args.iterations, args.stop_after or args.iterations)
-        if saved["iteration"] >= last:
-            fail(f"{path} is at iteration {saved['iteration']} already: give more --iterations or --stop-after")
+        if saved["iteration"] >= args.iterations:
+            fail(f"{path} is at iteration {saved['iteration']} already: give more --iterations")
         if (ranks := len(saved["ranks"])) != distributed.size():
             fail(f"{path} was trained by {ranks} processes, not {distributed.size()}")
         if args.device.partition(":")[0] != defaults.device.partition(":")[0]:

@@ -66,11 +66,11 @@ def capture(
             return result
         if calls == WARMUP + 1:
             torch.cuda.synchronize(device)
-            start = env.pin() if env is not None else None
+            start = env.pin_window() if env is not None else None
             with torch.cuda.graph(graph, stream=stream):
                 result = function()
                 if env is not None and start is not None:
-                    env.carry_over(start)
+                    env.write_back(start)
         graph.replay()
         return result
 

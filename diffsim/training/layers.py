@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from diffsim.extra.mirror import Mirror, Reflection
 from diffsim.training import distributed
 from diffsim.training.errors import fail
+
+
+class Reflection(Protocol):
+    """How numbers look in a mirror: a permutation with signs, its own inverse."""
+
+    @property
+    def index(self) -> Tensor: ...  # (n,) from where each number comes
+
+    @property
+    def sign(self) -> Tensor: ...  # (n,) 1 or -1, of each number after the permutation
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Return the mirror image (..., n) of x (..., n)."""
 
 
 class ObsNormalizer(nn.Module):
@@ -19,11 +32,16 @@ class ObsNormalizer(nn.Module):
     The statistics are buffers, so they are saved with the policy that depends on them. Without the size of an
     observation it normalizes scalars. With a mirror they are those of all observations and their mirror images, so
     that the normalized image is the image of the normalized observation.
+
+    Attributes:
+        mirror: of observations; None at first.
     """
 
-    def __init__(self, size: int | None = None, mirror: Mirror | None = None) -> None:
+    mirror: Reflection | None = None
+
+    def __init__(self, size: int | None = None) -> None:
         super().__init__()
-        self.size, self.mirror = size, mirror and mirror.obs
+        self.size = size
         shape = () if size is None else (size,)
         self.count: Tensor = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
         self.mean: Tensor = nn.Buffer(torch.zeros(shape))
@@ -95,12 +113,16 @@ def mlp(
     activation: Callable[[], nn.Module],
     norm: bool = False,
     orthogonal: bool = False,
+    columns: int | None = None,
 ) -> Chain:
-    """Linear, activation and, if asked for, LayerNorm per hidden layer, and a linear output unless it is None.
+    """Stack linear, activation and, if asked for, LayerNorm per hidden layer, and a linear output unless it is None.
 
-    Weights are initialised as torch does, or orthogonal with gain sqrt(2) and zero biases.
+    Weights are initialised as torch does, or orthogonal with gain sqrt(2) and zero biases. The network sees the first
+    columns of its inputs only, or all of them (None).
     """
     layers = list[nn.Module]()
+    if columns is not None:
+        layers, inputs = [First(columns)], columns
     for width in hidden:
         layers += [nn.Linear(inputs, width), activation(), *([nn.LayerNorm(width)] if norm else [])]
         inputs = width
@@ -123,15 +145,14 @@ class First(nn.Module):
         return x[..., : self.columns]
 
 
-class Both(nn.Module):
+class WithMirrorImage(nn.Module):
     """Rows (..., B, n), and then their mirror images: (..., 2 B, n)."""
 
-    def __init__(self, size: int, reflection: Reflection | None = None) -> None:
+    def __init__(self, size: int, index: Tensor | None = None, sign: Tensor | None = None) -> None:
         super().__init__()
         self.size = size  # n
-        # On the CPU, where every module begins
-        self.index: Tensor = nn.Buffer(torch.arange(size) if reflection is None else reflection.index.cpu())
-        self.sign: Tensor = nn.Buffer(torch.ones(size) if reflection is None else reflection.sign.cpu())
+        self.index: Tensor = nn.Buffer(torch.arange(size) if index is None else index)
+        self.sign: Tensor = nn.Buffer(torch.ones(size) if sign is None else sign)
 
     def image(self, x: Tensor) -> Tensor:
         return x.index_select(-1, self.index) * self.sign
@@ -140,8 +161,8 @@ class Both(nn.Module):
         return torch.cat((x, self.image(x)), dim=-2)
 
 
-class Fold(Both):
-    """What a network makes of both (..., 2 B, n) as one (..., B, n): the mean of the first half and the second's image.
+class MirrorMean(WithMirrorImage):
+    """Outputs for rows and for their images (..., 2 B, n): the mean of the first half and the second half's image.
 
     So f becomes (f(s) + M f(M s)) / 2: for the mirror image of s it is exactly the image of what it is for s.
     """
@@ -151,45 +172,40 @@ class Fold(Both):
         return (own + self.image(other)) / 2
 
 
-class Even(Both):
+class SymmetricParameter(WithMirrorImage):
     """Numbers (..., n) without direction, such as standard deviations: the mean of those of both sides."""
 
     def forward(self, x: Tensor) -> Tensor:
         return (x + x.index_select(-1, self.index)) / 2
 
 
-def seeing(columns: int | None, network: nn.Sequential, mirror: Mirror | None = None) -> nn.Sequential:
-    """A network that sees only the first columns of its input, or all (None); with a mirror, their image as well.
+def mirror_inputs(network: nn.Sequential | nn.ModuleList, reflection: Reflection) -> None:
+    """Let a network of observations see their mirror images as well.
 
     Raises:
-        UsageError: the image has other columns than those.
+        UsageError: the network sees some columns only, whose images have others.
     """
-    layers = list(network)
-    if mirror is not None:
-        index, sign = (part[:columns] for part in (mirror.obs.index, mirror.obs.sign))
-        if (index >= len(index)).any():
-            fail(
-                f"--symmetric: the first {columns} numbers of an observation, which the actor sees, need others' images"
-            )
-        layers.insert(0, Both(len(index), Reflection(index, sign)))
-    if columns is not None:
-        layers.insert(0, First(columns))
-    return type(network)(*layers)
+    first = network[0] if len(network) else None
+    columns = first.columns if isinstance(first, First) else None
+    index, sign = (part[:columns] for part in (reflection.index, reflection.sign))
+    if (index >= len(index)).any():
+        fail(f"--symmetric: the first {columns} numbers of an observation, which the actor sees, need others' images")
+    network.insert(0 if columns is None else 1, WithMirrorImage(len(index), index, sign))
 
 
-def folded(network: nn.Sequential, reflection: Reflection | None) -> nn.Sequential:
-    """A network on what `seeing` makes of a state and its image, with the mean of what both say; None: as it is."""
-    return network if reflection is None else network.append(Fold(len(reflection.index), reflection))
+def mirror_outputs(network: nn.Sequential | nn.ModuleList, reflection: Reflection) -> None:
+    """Let a network after `mirror_inputs` end with the mean of its output and the image of that for the image."""
+    network.append(MirrorMean(len(reflection.index), reflection.index, reflection.sign))
 
 
-def make_even(module: nn.Module, name: str, mirror: Mirror | None) -> None:
-    """Let a parameter (..., nu) that has no direction be equal on both sides, if there is a mirror."""
-    if mirror is not None:
-        parametrize.register_parametrization(module, name, Even(len(mirror.action.index), mirror.action))
+def make_symmetric(module: nn.Module, name: str, reflection: Reflection) -> None:
+    """Let a parameter (..., n) that has no direction be equal on both sides."""
+    both = SymmetricParameter(len(reflection.index), reflection.index, reflection.sign)
+    parametrize.register_parametrization(module, name, both)
 
 
 def moments(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Variance and mean of x (B, ...) over the B of all ranks."""
+    """Compute the variance and mean of x (B, ...) over the B of all ranks."""
     var, own = torch.var_mean(x, dim=0, correction=0)
     mean = distributed.average(own.clone())
     return distributed.average(var + (own - mean) ** 2), mean

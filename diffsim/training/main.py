@@ -1,4 +1,4 @@
-"""The main function of a script: its command line, what follows from it, and errors in one line."""
+"""The main function of a script: parse its command line, train or evaluate, report errors in one line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ P = ParamSpec("P")
 def script(
     flags: type[Args], train: Callable[[Args], None], evaluate: Callable[[Args], None] = evaluate_checkpoint
 ) -> Callable[..., None]:
-    """The main function of a learner: parses a command line, by default the process's, and trains or evaluates."""
+    """Make a learner's main function: it parses a command line, by default the process's, and trains or evaluates."""
 
     def main(argv: Sequence[str] | None = None) -> None:
         args = parse(flags, argv)
@@ -47,7 +47,7 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         report, threading.excepthook = threading.excepthook, _report_in_thread
         if main.__module__ == "__main__":
-            gc.freeze()  # what a script has imported stays: the collector need not look through it
+            gc.freeze()  # keep imported objects out of garbage collection
         try:
             main(*args, **kwargs)
         except BrokenPipeError:

@@ -15,7 +15,7 @@ PLAIN: dict[str, Any] = dict(weight_decay=0.0, eps=1e-8, amsgrad=False, maximize
 
 
 class ClippedAdam:
-    """Adam on the gradient, averaged over the ranks and clipped to a norm; bad gradients are counted and skipped.
+    """Adam on gradients clipped to a norm, which are averaged over the ranks; bad ones are counted and skipped.
 
     The module's parameters become views of one vector, so a step is a dozen operations for any network; none of them
     waits for the device, so a step can be captured into a CUDA graph. The update is torch's own fused kernel. It is
@@ -53,21 +53,24 @@ class ClippedAdam:
         self._adam: dict[str, Any] = dict(lr=self.lr, beta1=betas[0], beta2=betas[1], **PLAIN)
 
     def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
-        """All numbers in one tensor."""
+        """Join all numbers in one tensor."""
         return torch.cat([tensor.flatten() for tensor in tensors])
 
     def _adopt(self, vector: Tensor) -> None:
         """Make the parameters views of it."""
         nn.utils.vector_to_parameters(vector, self.parameters)
 
-    def step(self, loss: Tensor) -> Tensor:
-        """One descent step; returns the gradient's norm () before clipping.
+    def gradient(self, loss: Tensor) -> Tensor:
+        """Compute the gradient of a loss in the parameters, flat like `vector`: the mean over the ranks.
 
         Raises ValueError if the loss has no gradient at all, as of a task that leaves torch's graph.
         """
         if not loss.requires_grad:
             fail("the loss has no gradient: observe and reward must be torch operations, without detach and no_grad")
-        gradient = distributed.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
+        return distributed.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
+
+    def step(self, gradient: Tensor) -> Tensor:
+        """Take one descent step; returns the gradient's norm () before clipping."""
         norm = torch.linalg.vector_norm(gradient)
         good = norm < self.skip_norm
         bad = (~good).to(norm.dtype)
@@ -77,7 +80,7 @@ class ClippedAdam:
         return norm
 
     def _update(self, gradient: Tensor, **scaled: Any) -> None:
-        """Adam's update along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
+        """Apply Adam along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
         state: tuple[list[Tensor], ...] = [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]
         torch._fused_adam_([self.vector], [gradient], *state, **self._adam | scaled)
 

@@ -1,4 +1,4 @@
-"""What values on a command line may be, said in the types of a dataclass of flags."""
+"""Types of flags that name the allowed values."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ LARGEST = torch.finfo(torch.float32).max
 
 @dataclass(frozen=True)
 class Range:
-    """What a value on the command line may be."""
+    """Which values of a flag are allowed."""
 
     words: str
     holds: Callable[[Any], bool]
+    minus_infinity: bool = False  # allowed
 
     def complaint(self, value: Any) -> str | None:
+        if self.minus_infinity and value == -math.inf:
+            return None
         if isinstance(value, float) and not abs(value) <= LARGEST:
             return f"must be finite{' in single precision' if math.isfinite(value) else ''}, not {value}"
         return None if self.holds(value) else f"must be {self.words}, not {value}"
@@ -34,11 +37,12 @@ def _whole(least: int, most: int) -> Range:
 Count = Annotated[int, _whole(1, 10**9)]
 Natural = Annotated[int, _whole(0, 10**9)]
 Batch = Annotated[int, _whole(1, 10**6)]  # samples drawn at once
-Repeats = Annotated[int, _whole(1, 10_000)]  # what takes time one after the other
-Few = Annotated[int, _whole(1, 1_000)]  # networks side by side
-Several = Annotated[int, _whole(2, 1_000)]  # parts of which one alone is none
+UpTo10k = Annotated[int, _whole(1, 10_000)]
+UpTo1000 = Annotated[int, _whole(1, 1_000)]
+AtLeast2 = Annotated[int, _whole(2, 1_000)]
 Width = Annotated[int, _whole(1, 16_384)]
 Finite = Annotated[float, Range("finite", math.isfinite)]
+LogStd = Annotated[float, Range("finite or -inf", math.isfinite, minus_infinity=True)]
 Positive = Annotated[float, Range("positive", lambda value: value > 0)]
 NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
 Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]

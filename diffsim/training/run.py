@@ -27,24 +27,23 @@ from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
 from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, make_unused, say
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import FINER, Evaluation, Player, make_env, write_evaluation
-from diffsim.training.flags import Flags, ParallelFlags
+from diffsim.training.evaluation import Evaluation, Player, compare_finer, make_env, write_evaluation
+from diffsim.training.flags import Flags
 from diffsim.training.graph import Mark
 from diffsim.training.layers import ObsNormalizer
-from diffsim.training.monitor import STEPS, Monitor
 
 L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
-TOLD = {  # totals, and how a message tells that they have doubled
+REPORTED = {  # totals that are reported each time they double
     "grad/skipped": "updates skipped so far because of their gradients: {:.0f}; if many, shorten --horizon",
     "sim/unconverged": "control steps so far in which Newton's method did not converge: {:.0f}; give more --substeps",
 }
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 RANK_SEED = 1_000_003  # between the seeds of two ranks
-LOG_EVERY = 10  # iterations between two at whose end a GPU is waited for, to write all of them
-RUNS = Path("runs")  # where runs are that are given no directory
+LOG_EVERY = 10  # a GPU's iterations are written in batches of this many, so that the host rarely waits
+RUNS = Path("runs")  # parent of runs without --run-dir
 
 
 def is_due(iteration: int, every: int) -> bool:
@@ -68,9 +67,13 @@ class Run:
 
     Of several ranks only the first writes anything. The script's arguments must be complete. Random numbers are seeded
     by args.seed here.
+
+    Tests and benchmarks change the class attributes.
     """
 
-    simulator = checkpoint.HOME  # which its environments have
+    simulator = checkpoint.HOME  # of its environments
+    stop_after = 0  # iteration after which it stops and saves as after Ctrl-C; 0: none
+    graphs = True  # on a GPU, replay iterations as CUDA graphs
 
     def __init__(self, args: Flags) -> None:
         self.args = args
@@ -89,7 +92,7 @@ class Run:
         torch.manual_seed(args.seed)
         self.iteration, self.seconds, self.control_steps = 0, 0.0, 0
         self._saved = self._state["iteration"] if self._state else 0
-        self.last = min(args.iterations, args.stop_after or args.iterations)
+        self.last = min(args.iterations, self.stop_after or args.iterations)
         self._totals, self._episodes = {f"sim/{name}": 0 for name in TOTALS}, EpisodeStatistics()
         self._env: DiffEnv | None = None
         self._variation: Any = None
@@ -102,10 +105,8 @@ class Run:
         self._mark = Mark(self.device)
         self._evaluation: tuple[int, Evaluation] | None = None
         self._player: Player | None = None
-        self._graphs = getattr(args, "cuda_graph", False)  # a flag of ParallelFlags
         self._scalars: dict[str, float] = {}  # that were written last
-        self._monitor: Monitor | None = None
-        self._told = dict.fromkeys(TOLD, 0.0)  # by messages
+        self._reported = dict.fromkeys(REPORTED, 0.0)
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
         self._opened = False
@@ -165,9 +166,14 @@ class Run:
             self._episodes.windows.extend(state["episodes"])
         return learner
 
-    def capture(self, function: Callable[[], Metrics], env: DiffEnv | None = None) -> Callable[[], Metrics]:
-        """Half an iteration, timed as time/{name}; on a GPU its calls replay one CUDA graph. See graph.capture."""
-        call = graph.capture(function, self.device, env) if self._graphs else function
+    def capture(
+        self, function: Callable[[], Metrics], env: DiffEnv | None = None, eager: bool = False
+    ) -> Callable[[], Metrics]:
+        """Time an iteration, or a part of it, as time/{name}; on a GPU, unless eager, its calls replay one CUDA graph.
+
+        See graph.capture.
+        """
+        call = graph.capture(function, self.device, env) if self.graphs and not eager else function
 
         def timed() -> Metrics:
             begin = Mark(self.device)
@@ -227,32 +233,11 @@ class Run:
         times = self._times | {"time/total": (begin, self._mark)}
         self._records.append(Record(self.iteration, steps, list(tensors), numbers, scalars, times))
         self._times = {}
-        if self._env is not None and (found := self._watch(self._env)):
-            self._records[-1].scalars |= found
-            self._mark = Mark(self.device)  # no time of training
-
-    def _watch(self, env: DiffEnv) -> dict[str, float]:
-        """What --monitor measures, in the iterations that are due."""
-        args, learner = self.args, self._learner
-        if not self.writes or learner is None or not isinstance(args, ParallelFlags):
-            return {}
-        if not is_due(self.iteration, args.monitor):
-            return {}
-        self._check_learner()  # no replay of a policy that has diverged
-        self._monitor = self._monitor or Monitor(args, env)
-        found = self._monitor.replay(learner.policy)
-        if self._monitor.suspects(found):
-            error = f"{found['sim/state_error']:.2g} m or rad"
-            self.message(
-                f"iteration {self.iteration}: with {FINER} times the substeps the robot is {error} elsewhere after "
-                f"{STEPS} steps: the policy learns the integrator's errors; give more --substeps"
-            )
-        return found
 
     def evaluate(self, policy: nn.Module) -> None:
         """Evaluate the deterministic policy, always of one architecture, in the iteration that was logged last."""
         begin = Mark(self.device)
-        self._player = self._player or Player(self.eval_env, policy, self._graphs)
+        self._player = self._player or Player(self.eval_env, policy, self.graphs)
         self._player.take(policy)
         self.log_evaluation(self._player.evaluate())
         self._records[-1].times["time/evaluation"] = begin, Mark(self.device)
@@ -304,9 +289,9 @@ class Run:
                 scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
         scalars["charts/SPS"] = record.steps / times["time/total"]
         self._scalars = scalars
-        for name, text in TOLD.items():
-            if (total := scalars.get(name, 0.0)) > 2 * self._told[name]:
-                self._told[name] = total
+        for name, text in REPORTED.items():
+            if (total := scalars.get(name, 0.0)) > 2 * self._reported[name]:
+                self._reported[name] = total
                 self.message(f"iteration {record.iteration}: {text.format(total)}")
         if self._log is not None:
             with self._writing():
@@ -397,7 +382,7 @@ class Run:
             return
         self._check_learner()
         args = {k: None if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.args).items()}
-        args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
+        args["device"] = self.args.device if len(ranks) == 1 else self.device.type
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
         state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
         state |= dict(simulator=self.simulator, task=find_task(self.args.env).stored())
@@ -431,4 +416,11 @@ class Run:
         if self.iteration < args.iterations:
             say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} continues")
         elif self._evaluation:
-            write_evaluation(args, self._evaluation[1], self.iteration)
+            evaluation, player = self._evaluation[1], self._player
+            found = compare_finer(args, evaluation, self._evaluate_finer) if player is not None else {}
+            write_evaluation(args, evaluation, self.iteration, **found)
+
+    def _evaluate_finer(self, args: Flags) -> Evaluation:
+        """Evaluate the policy of the last evaluation once more, in environments of other arguments."""
+        assert self._player is not None
+        return Player(make_env(args, args.eval_episodes), self._player.policy, self.graphs).evaluate()

@@ -174,7 +174,7 @@ def test_a_search_on_several_terrains(tmp_path: Path, slopes: Path, monkeypatch:
 def test_a_resumed_search_is_the_same(tmp_path: Path, slopes: Path) -> None:
     flags = [*SMALL, "--terrain", *SLOPES[:2], "--demonstration", slopes]
     whole = run(gps_variants, tmp_path / "whole", *flags)
-    run(gps_variants, tmp_path / "parts", *flags, "--stop-after", 1)
+    run(gps_variants, tmp_path / "parts", *flags, stop_after=1)
     gps_variants.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
     parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
     assert_same(parts["modules"], whole["modules"])

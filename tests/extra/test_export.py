@@ -19,7 +19,7 @@ from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.tracking import G1Track
 from diffsim.extra.robots.joystick import Go1
 from diffsim.tasks.base import ASSETS
-from diffsim.training import Likeliest, ObsNormalizer, load_policy, make_policy_env, parse
+from diffsim.training import Likeliest, ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
 
 STATE: dict[str, Any] = {"args": {"env": "cartpole"}, "iteration": 1}
@@ -66,7 +66,7 @@ def test_a_policy_that_tracks_takes_the_clip_as_an_input(tmp_path: Path) -> None
     torch.manual_seed(0)
     env = diffsim.make("g1_track:g1_jazz_walk", 3, seed=0)
     args = parse(shac.Args, "--env g1_track:g1_jazz_walk --device cpu --actor-hidden 16".split())
-    policy = shac.Actor(args, env, None).deterministic()
+    policy = shac.Actor(args, env).deterministic()
     kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
     save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": kept, "iteration": 7})
     model, told = export(path, tmp_path / "policy.onnx")
@@ -108,7 +108,7 @@ def test_an_exported_policy_holds_a_clip_that_is_not_shipped_and_may_have_16_bit
         sizes.append(output.stat().st_size)
         monkeypatch.setattr(tasks, "_restored", {})
         saved = load_policy(output)
-        assert make_policy_env(saved, 1).task.clip == clip  # type: ignore[attr-defined]
+        assert tasks.find_task(saved.args["env"])().clip == clip  # type: ignore[attr-defined]
         assert (output.stat().st_size < 50_000) == (name == "g1_jazz_walk")
         wanted = policy[0].weight.half().float() if half else policy[0].weight
         assert torch.equal(saved.network[0].weight, wanted)
@@ -121,7 +121,8 @@ def test_onnx_takes_only_what_the_actor_sees(symmetric, tmp_path):
     env = diffsim.make("go1", 1)
     seen, whole = Go1.actor_dim, Go1.obs_dim
     args = parse(shac.Args, "--env go1 --device cpu --actor-hidden 16".split())
-    actor = shac.Actor(args, env, env.task.mirror if symmetric else None)
+    args.symmetric = symmetric
+    actor = shac.SHAC(args, env).actor
     actor.normalizer.update(3.0 + 2.0 * torch.randn(100, whole) * torch.rand(whole))
     kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
     policy = actor.deterministic()[:-1]  # without tanh: actions leave [-1, 1]

@@ -153,7 +153,7 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
     path = str(POLICIES / "ant.pt")
     flags = f"--evaluate {path} --eval-episodes 2 --no-implicit --device cpu --run-dir {tmp_path}"
     SCRIPTS["sapo"].main(flags.split())
-    returns, _, *table = capsys.readouterr().out.splitlines()
+    returns, *table = capsys.readouterr().out.splitlines()
     parts = gait.Gait()
     with (tmp_path / "gait.csv").open() as file:
         for row in csv.DictReader(file):

@@ -43,6 +43,7 @@ def test_gymnasium_makes_every_kind(name: str, monkeypatch: pytest.MonkeyPatch) 
         vector = gymnasium.make_vec(IDS[name].replace("-v0", suffix), num_envs=3)
         assert type(vector) is kind and vector.num_envs == 3
         assert vector.unwrapped.episode_length == task.episode_length
+        assert gymnasium.spec(IDS[name].replace("-v0", suffix)).max_episode_steps == task.episode_length
         vector.close()
     single.close()
 

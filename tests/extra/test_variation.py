@@ -167,8 +167,8 @@ def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(
     whole = run(shac, tmp_path / "whole", *flags.split())
     assert len(seen) == 4 and not any(torch.equal(a, b) for a, b in pairwise(seen))
     assert all((factors[:, FACTORS.index("mass")] != 1).all() for factors in seen)
-    run(shac, tmp_path / "part", *flags.split(), "--stop-after", 2)
-    part = run(shac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
+    run(shac, tmp_path / "part", *flags.split(), stop_after=2)
+    part = run(shac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--quiet")
     assert_same(part["modules"], whole["modules"])
     assert whole["args"]["contact"] == "mujoco"
     saved = str(tmp_path / "part" / "checkpoint.pt")

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from diffsim.robot.mjcf import load_scene
-from diffsim.tasks import TASKS
+from diffsim.tasks import REGISTERED, TASKS, TaskError, base_name, find_task
 from diffsim.tasks.base import ASSETS
 
 Array = NDArray[np.float64]
@@ -42,6 +42,25 @@ every_task = pytest.mark.parametrize("name", list(START))
 
 def load(name: str) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(ASSETS / f"{name}.xml"))
+
+
+def test_every_registered_task_is_found_by_its_name() -> None:
+    assert list(TASKS) == list(REGISTERED) and len(TASKS) == 13 and "ant" in TASKS and "nothing" not in TASKS
+    for name, task in TASKS.items():
+        assert task.name == name and find_task(name) is find_task(task) is task is TASKS[name]
+    with pytest.raises(TaskError, match="unknown task 'nothing': choose from cartpole, .*, g1_track, or give a file"):
+        find_task("nothing")
+
+
+def test_a_name_without_its_options() -> None:
+    for name, base in (
+        ("ant", "ant"),
+        ("go2:rough=20,mass=0.9:1.1", "go2"),
+        ("g1_track:/tmp/walk.csv:60", "g1_track"),
+        ("my/task.py", "my/task.py"),
+        ("my/task.py:Class", "my/task.py:Class"),
+    ):
+        assert base_name(name) == base
 
 
 # The MJCF files

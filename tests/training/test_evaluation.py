@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from learners import run
 from torch import nn
 
 import diffsim
@@ -62,7 +63,7 @@ def test_evaluations_are_alike_whatever_was_before() -> None:
     env, policy = diffsim.make("ant", num_envs=4, seed=0), torch.nn.Linear(37, 8)
     player, expected = evaluation.Player(env, policy), evaluate(diffsim.make("ant", num_envs=4), policy)
     player.evaluate(seed=5)
-    pinned = env.pin()
+    pinned = env.pin_window()
     again = player.evaluate()
     assert torch.equal(again.returns, expected.returns) and torch.equal(again.qpos, expected.qpos)
     env.reset(seed=evaluation.SEED)
@@ -112,23 +113,40 @@ def test_the_video_is_of_the_median_episode(
 
 
 def test_evaluate_a_checkpoint_with_other_substeps(
-    tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Returns of cartpole are costs, so the share that is kept is the inverse ratio."""
 
-    def found(folder: str, *flags: str) -> dict[str, Any]:
+    def found(folder: str, *flags: str, finer: int = 0) -> dict[str, Any]:
+        monkeypatch.setattr(evaluation, "FINER", finer)
         path = tmp_path / "new" / folder
         shac.main(["--evaluate", str(tiny_run / "checkpoint.pt"), "--run-dir", str(path), *flags])
         return json.loads((path / "evaluation.json").read_text())
 
-    own = found("own")
+    own = found("own", finer=4)
     finer, out = own.pop("finer"), capsys.readouterr().out
     assert own == json.loads((tiny_run / "evaluation.json").read_text()) and "gait" not in out
     assert own["speed"] is None and own["lengths"] == [240, 240]  # a robot without ground
     assert out.startswith(f"cartpole, 2 episodes: return median {own['return']:.1f}, mean ")
     assert finer["substeps"] == 16 and finer["kept"] == pytest.approx(own["return"] / finer["return"])
     assert f"\n16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} retained" in out
-    explicit = found("explicit", *"--no-implicit --substeps 16 --no-finer".split())
+    explicit = found("explicit", *"--no-implicit --substeps 16".split())
     assert explicit["return"] == finer["return"] and "finer" not in explicit
-    other = found("other", *"--substeps 16 --eval-episodes 4 --no-finer".split())["settings"]
+    other = found("other", *"--substeps 16 --eval-episodes 4".split())["settings"]
     assert (other["substeps"], other["eval_episodes"], other["iteration"]) == (16, 4, 2)
+
+
+def test_a_run_ends_with_the_return_at_finer_substeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As --evaluate says it, unless the run is stopped early."""
+    monkeypatch.setattr(evaluation, "FINER", 4)
+    flags = "--env cartpole --device cpu --num-envs 4 --horizon 4 --iterations 3 --eval-episodes 2 --quiet"
+    run(shac, tmp_path, *flags.split(), stop_after=2)
+    assert "retained" not in capsys.readouterr().out
+    run(shac, tmp_path, "--resume", tmp_path)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "retained" in line]
+    written = json.loads((tmp_path / "evaluation.json").read_text())
+    shac.main(["--evaluate", str(tmp_path)])
+    assert line in capsys.readouterr().out and line.startswith("semi_implicit with 16 substeps: return median ")
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == written and written["finer"]["substeps"] == 16

@@ -31,7 +31,7 @@ def test_the_optimizer_is_bitwise_what_torchs_fused_adam_computes() -> None:
         loss = scale * module(torch.randn(20, 3)).square().mean()
         gradients = torch.autograd.grad(loss, optimizer.parameters, retain_graph=True)
         reference.grad = torch.cat([g.flatten() for g in gradients])
-        norm = optimizer.step(loss)
+        norm = optimizer.step(optimizer.gradient(loss))
         torch.testing.assert_close(norm, torch.linalg.vector_norm(reference.grad), equal_nan=True)
         hooks.grad_scale, hooks.found_inf = (norm / 0.5).clamp(min=1.0), (~(norm < 1e6)).float()
         adam.step()
@@ -43,7 +43,7 @@ def test_the_optimizer_is_bitwise_what_torchs_fused_adam_computes() -> None:
 
 def test_a_loss_without_a_gradient_is_named() -> None:
     with pytest.raises(ValueError, match="the loss has no gradient: observe and reward must be torch operations"):
-        ClippedAdam(nn.Linear(2, 1), 0.5).step(torch.zeros(()))
+        ClippedAdam(nn.Linear(2, 1), 0.5).gradient(torch.zeros(()))
 
 
 # Running statistics ---------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import ROOT, SMALL, assert_same, read_progress, refusal, run
+from learners import ROOT, SMALL, assert_same, read_progress, refusal, run, stopped
 from torch import Tensor, nn
 
 import bptt
@@ -39,16 +39,16 @@ TINY = "--env cartpole --num-envs 2 --horizon 8 --eval-episodes 1 --device cpu".
 
 
 @pytest.mark.parametrize(
-    ("arguments", "evaluated", "saved"),
+    ("arguments", "stop_after", "evaluated", "saved"),
     [
-        ("--iterations 7 --eval-every 3 --save-every 2", [3, 6, 7], [2, 4, 6, 7]),
-        ("--iterations 4 --eval-every 2 --save-every 4", [2, 4], [4]),
-        ("--iterations 5 --eval-every 0 --save-every 0", [5], [5]),
-        ("--iterations 5 --eval-every 2 --save-every 0 --stop-after 3", [2], [3]),
-        ("--iterations 5 --eval-every 0 --save-every 2 --stop-after 9", [5], [2, 4, 5]),
+        ("--iterations 7 --eval-every 3 --save-every 2", 0, [3, 6, 7], [2, 4, 6, 7]),
+        ("--iterations 4 --eval-every 2 --save-every 4", 0, [2, 4], [4]),
+        ("--iterations 5 --eval-every 0 --save-every 0", 0, [5], [5]),
+        ("--iterations 5 --eval-every 2 --save-every 0", 3, [2], [3]),
+        ("--iterations 5 --eval-every 0 --save-every 2", 9, [5], [2, 4, 5]),
     ],
 )
-def test_schedule(arguments, evaluated, saved, tmp_path, monkeypatch, capsys):
+def test_schedule(arguments, stop_after, evaluated, saved, tmp_path, monkeypatch, capsys):
     iterations, save = list[int](), checkpoint.save
 
     def record(path: Path, script: str, learner: checkpoint.Learner, state: Mapping[str, Any]) -> None:
@@ -56,11 +56,11 @@ def test_schedule(arguments, evaluated, saved, tmp_path, monkeypatch, capsys):
         save(path, script, learner, state)
 
     monkeypatch.setattr(checkpoint, "save", record)
-    run(bptt, tmp_path, *TINY, *arguments.split(), "--quiet")
+    run(bptt, tmp_path, *TINY, *arguments.split(), "--quiet", stop_after=stop_after)
     assert iterations == saved
     rows = read_progress(tmp_path)
     assert [int(row["iteration"]) for row in rows if row.get("eval_return")] == evaluated
-    out, finished = capsys.readouterr().out, "--stop-after 3" not in arguments
+    out, finished = capsys.readouterr().out, stop_after != 3
     assert ("stopped early: python bptt.py --resume" in out) != finished
     assert (tmp_path / "evaluation.json").exists() == finished
     assert f"evaluation of iteration {evaluated[-1]}, 1 episodes: return median" in out
@@ -206,7 +206,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, tmp_path, caps
     """What does not fit is the checkpoint, or the progress."""
     import resource
 
-    run(bptt, tmp_path, *TINY, "--iterations", 50, "--stop-after", 2, "--quiet")
+    run(bptt, tmp_path, *TINY, "--iterations", 50, "--quiet", stop_after=2)
     path = tmp_path / "checkpoint.pt"
     whole, (soft, hard) = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
 
@@ -242,13 +242,13 @@ def test_bad_gradients_and_states_are_counted_across_a_resume(tmp_path, monkeypa
 
     monkeypatch.setattr(shac, "actor_loss", sometimes_large)
     monkeypatch.setattr(shac, "collect", sometimes_thrown)
-    saved = run(shac, tmp_path, *SMALL["shac"], "--stop-after", 3)
+    saved = run(shac, tmp_path, *SMALL["shac"], stop_after=3)
     optimizer = saved["modules"]["actor_optimizer"]
     assert optimizer["skipped"] == 1 and optimizer["adam"][0]["step"] == 2
     assert saved["totals"] == {"sim/nonfinite": 1, "sim/nonfinite_gradients": 12}
     summary = "skipped 1 updates, contained 1 non-finite states and {} gradients"
     assert summary.format(12) in capsys.readouterr().out
-    shac.main(["--resume", str(tmp_path / "checkpoint.pt"), "--stop-after", "5"])
+    run(shac, tmp_path, "--resume", tmp_path / "checkpoint.pt", stop_after=5)
     assert summary.format(30) in capsys.readouterr().out
     for name in ("grad_skipped", "sim_nonfinite"):
         assert [float(row[name]) for row in read_progress(tmp_path)] == [0, 1, 1, 1, 1]
@@ -256,9 +256,9 @@ def test_bad_gradients_and_states_are_counted_across_a_resume(tmp_path, monkeypa
 
 
 def test_other_hyperparameters_hold_from_a_resume_on(tmp_path):
-    ends = []
-    run(bptt, tmp_path / "start", *TINY, "--iterations", 4, "--stop-after", 2, "--quiet")
-    for arguments in ([], ["--betas", "0.9", "0.999"], ["--max-grad-norm", "1e-6"], ["--gamma", "0.5"]):
+    ends = list[Tensor]()
+    run(bptt, tmp_path / "start", *TINY, "--iterations", 4, "--quiet", stop_after=2)
+    for arguments in ([], ["--lr", "1e-6"], ["--gamma", "0.5"]):
         path = shutil.copytree(tmp_path / "start", tmp_path / str(len(ends))) / "checkpoint.pt"
         bptt.main(["--resume", str(path), *arguments])
         ends.append(checkpoint.load(path)["modules"]["actor"]["mean.0.weight"])
@@ -271,13 +271,23 @@ def test_other_hyperparameters_hold_from_a_resume_on(tmp_path):
 def test_a_run_goes_on_by_new_episodes_on_other_ground(tmp_path, monkeypatch):
     monkeypatch.setattr(diffsim.Simulator, "advance", lambda _, qpos, qvel, ctrl: (qpos, qvel + 0.01 * ctrl.sum()))
     words = "--num-envs 4 --horizon 4 --critic-iterations 1 --eval-episodes 1 --eval-every 0 --quiet"
-    flags = [*words.split(), *"--device cpu --env hopper:rough=20 --iterations 2 --stop-after 1 --run-dir".split()]
-    shac.main([*flags, str(first := tmp_path / "first")])
+    flags = [*words.split(), *"--device cpu --env hopper:rough=20 --iterations 2".split()]
+    run(shac, first := tmp_path / "first", *flags, stop_after=1)
     for rough, length in (("20", 8), ("10", 4)):
         shutil.copytree(first, path := tmp_path / rough)
-        shac.main(["--resume", str(path), "--env", f"hopper:rough={rough}", "--stop-after", "2", "--quiet"])
+        shac.main(["--resume", str(path), "--env", f"hopper:rough={rough}", "--quiet"])
         (rank,) = checkpoint.load(path / "checkpoint.pt")["ranks"]
         assert (rank["env"]["episode_step"] == length).all()
+
+
+def test_a_file_that_is_named_from_another_directory_continues_its_episodes(tmp_path, monkeypatch):
+    text = "from diffsim.tasks.cartpole import CartPole\nclass Mine(CartPole):\n    name = 'mine'\n"
+    (file := tmp_path / "mine.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    run(bptt, tmp_path / "run", *TINY, "--env", "mine.py", "--iterations", 2, "--stop-after", 1, "--quiet")
+    monkeypatch.chdir("/")
+    state = run(bptt, tmp_path / "run", "--resume", tmp_path / "run", "--env", file, "--stop-after", 2, "--quiet")
+    assert (state["ranks"][0]["env"]["episode_step"] == 16).all()
 
 
 def test_progress_and_messages(tmp_path, capsys):
@@ -344,12 +354,12 @@ def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path, monkeypatch):
     copy = tmp_path / "my-bptt.py"
     copy.write_text((ROOT / "bptt.py").read_text())
     monkeypatch.chdir(tmp_path)
-    first = [*TINY, "--iterations", "3", "--stop-after", "2", "--quiet"]
+    first = [*TINY, "--iterations", "2", "--quiet"]
     result = subprocess.run([sys.executable, copy.name, *first], capture_output=True, text=True, check=True)
-    assert "2 iterations, 32 control steps" in result.stdout
+    assert "2 iterations, 32 control steps" in result.stdout and "semi_implicit with 16 substeps" in result.stdout
     (directory,) = Path("runs").glob("cartpole__my-bptt__1__*")
     path = directory / "checkpoint.pt"
-    for arguments in (["--resume", str(path), "--quiet"], ["--evaluate", str(path)]):
+    for arguments in (["--resume", str(path), "--iterations", "3", "--quiet"], ["--evaluate", str(path)]):
         monkeypatch.setattr(sys, "argv", [copy.name, *arguments])
         runpy.run_path(copy.name, run_name="__main__")
     state = torch.load(path, weights_only=True)
@@ -394,7 +404,8 @@ def count(args: bptt.Args) -> Counter:
 
 def test_a_learner_without_training_environments(tmp_path, capsys):
     arguments = [*TINY, "--iterations", "4", "--eval-every", "3", "--run-dir", str(tmp_path)]
-    count(parse(bptt.Args, [*arguments, "--stop-after", "2", "--quiet"]))
+    with stopped(2):
+        count(parse(bptt.Args, [*arguments, "--quiet"]))
     drawn = torch.rand(1)
     counter = count(parse(bptt.Args, ["--resume", str(tmp_path / "checkpoint.pt")]))
     assert torch.equal(drawn, torch.rand(1))  # random numbers go on too
@@ -417,7 +428,7 @@ def test_a_learner_without_training_environments(tmp_path, capsys):
 
 
 def test_control_steps_accumulate_when_a_resume_changes_the_window(tmp_path):
-    run(bptt, tmp_path, *TINY, "--iterations", 4, "--stop-after", 2, "--quiet")
+    run(bptt, tmp_path, *TINY, "--iterations", 4, "--quiet", stop_after=2)
     bptt.main(["--resume", str(tmp_path / "checkpoint.pt"), "--horizon", "3"])
     rows = read_progress(tmp_path)
     assert [row["control_steps"] for row in rows] == ["16", "32", "38", "44"]

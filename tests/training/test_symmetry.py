@@ -14,11 +14,11 @@ from torch import Tensor, nn
 import diffsim
 import sapo
 import shac
-from diffsim.extra.mirror import Mirror, Reflection
+from diffsim.extra.mirror import Reflection
 from diffsim.tasks import TASKS
 from diffsim.training import ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
-from diffsim.training.layers import folded, seeing
+from diffsim.training.layers import First, mirror_inputs, mirror_outputs
 
 MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1")
 LEARNERS = {
@@ -137,7 +137,8 @@ def test_a_gpu_trains_and_keeps_it(script: str, task: str, tmp_path: Path) -> No
 def test_statistics_are_those_of_observations_and_their_images() -> None:
     torch.manual_seed(0)
     mirror = TASKS["humanoid"]().mirror
-    own, both = ObsNormalizer(76, mirror), ObsNormalizer(76)
+    own, both = ObsNormalizer(76), ObsNormalizer(76)
+    own.mirror = mirror.obs
     for _ in range(3):
         obs = 3.0 * torch.randn(40, 76) + torch.randn(76)
         own.update(obs)
@@ -161,12 +162,13 @@ def test_who_is_symmetric(script: str, capsys: pytest.CaptureFixture[str]) -> No
 
 def test_what_the_actor_sees_needs_its_own_image(capsys: pytest.CaptureFixture[str]) -> None:
     swap = Reflection(torch.tensor([0, 2, 1]), torch.ones(3))
-    mirror = Mirror(swap, swap, swap, swap)
-    for columns in (1, 3, None):
-        seeing(columns, nn.Sequential(), mirror)
+    for network in (nn.Sequential(First(1)), nn.Sequential(First(3)), nn.Sequential()):
+        mirror_inputs(network, swap)
     message = "--symmetric: the first 2 numbers of an observation, which the actor sees, need others' images"
-    assert message in refusal(lambda: seeing(2, nn.Sequential(), mirror), capsys)
+    assert message in refusal(lambda: mirror_inputs(nn.Sequential(First(2)), swap), capsys)
     f = nn.Sequential(nn.Linear(3, 3))
     x = torch.randn(5, 3)
     expected = (f(x) + swap(f(swap(x)))) / 2
-    torch.testing.assert_close(folded(seeing(None, f, mirror), swap)(x), expected)
+    mirror_inputs(f, swap)
+    mirror_outputs(f, swap)
+    torch.testing.assert_close(f(x), expected)

@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from diffsim.training import distributed
 from diffsim.training.optimizer import ClippedAdam
 
 
@@ -130,9 +129,8 @@ class EnsembleAdam(ClippedAdam):
         for p, own in zip(self.parameters, vector.flatten(0, 1).split(sizes, dim=-1), strict=True):
             p.data = own.view(p.shape)
 
-    def step(self, loss: Tensor) -> Tensor:
-        """One descent step of each; returns the gradients' largest norm () before clipping."""
-        gradient = distributed.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
+    def step(self, gradient: Tensor) -> Tensor:
+        """Take one descent step of each; returns the gradients' largest norm () before clipping."""
         if self.tied is not None:
             gradient = torch.where(self.tied > 0, gradient.mean(1, keepdim=True), gradient)
         norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)

@@ -11,12 +11,12 @@ FREQUENCY_OF_PUSHES = 0.25  # 1/s
 
 
 def score(square: Tensor, scale: float) -> Tensor:
-    """log(1 + square / scale): a parabola near 0; far away it does not drown the other terms, and has a slope."""
+    """Return log(1 + square / scale): a parabola near 0 that keeps a slope far away but does not dominate."""
     return torch.log1p(square / scale)
 
 
 def push(noise: Tensor, sizes: tuple[float, float], control_dt: float) -> Tensor:
-    """What a push at random, if one is due, adds to the root's horizontal velocity: (..., 2) m/s.
+    """Draw the change (..., 2) [m/s] of the root's horizontal velocity by a random push, 0 if none is due.
 
     Args:
         noise: (..., 3) uniform in [0, 1); 0.5 is no push.

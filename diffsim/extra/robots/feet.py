@@ -1,4 +1,4 @@
-"""Where a robot's feet are: the kinematics of its legs, in torch."""
+"""Feet: the kinematics of a robot's legs, in torch."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ class Feet(NamedTuple):
 
     @staticmethod
     def of(model: mujoco.MjModel, legs: Sequence[str], device: torch.device | str, dtype: torch.dtype) -> Feet:
-        """Of legs by the name of a joint of each. The contact point is the middle of the lowest points of the foot's
-        spheres in the first keyframe."""
+        """Read the legs, given by the name of a joint of each.
+
+        The contact point is the mean of the lowest points of the foot's spheres in the first keyframe.
+        """
         mujoco.mj_resetDataKeyframe(model, data := mujoco.MjData(model), 0)
         mujoco.mj_kinematics(model, data)
         touches = (model.geom_contype > 0) & (model.geom_bodyid > 0)
@@ -52,7 +54,7 @@ class Feet(NamedTuple):
         return Feet(joints, places, turns.movedim(2, 0).contiguous(), tensor(points).unsqueeze(-1))
 
     def places(self, joints: Tensor) -> Tensor:
-        """(..., L, 3) m of the contact points from the root, in its frame, at joints (..., n) rad."""
+        """Return the contact points (..., L, 3) [m] from the root, in its frame, at joints (..., n) [rad]."""
         angle = joints.index_select(-1, self.joint).unflatten(-1, (*self.place.shape[:2], 1, 1))
         turns = torch.addcmul(torch.addcmul(self.turn[0], angle.cos(), self.turn[1]), angle.sin(), self.turn[2])
         point = self.point
@@ -61,13 +63,13 @@ class Feet(NamedTuple):
         return point.squeeze(-1)
 
     def motion(self, joints: Tensor, rates: Tensor) -> tuple[Tensor, Tensor]:
-        """`places`, and the velocities (..., L, 3) m/s there, in the root's frame as if it rested; rates (..., n)."""
+        """Return `places`, and their velocities (..., L, 3) [m/s] in the root's frame; rates (..., n) [rad/s]."""
         there, here, then = self.places(torch.stack([joints + k * INSTANT * rates for k in (-1, 0, 1)])).unbind()
         return here, (then - there) / (2 * INSTANT)
 
 
 def _turns(model: mujoco.MjModel, body: int) -> Array:
-    """(3, 3, 3) of a body with one hinge, see Feet.turn."""
+    """Return the parts (3, 3, 3) of a body with one hinge, see Feet.turn."""
     mujoco.mju_quat2Mat(frame := np.empty(9), model.body_quat[body])
     axis = model.jnt_axis[model.body_jntadr[body]]
     along, across = np.outer(axis, axis), np.cross(axis, np.eye(3)).T

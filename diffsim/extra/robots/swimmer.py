@@ -1,6 +1,6 @@
 """Swimmer of guided policy search (Levine and Koltun 2013, appendix B): a snake of three links swims in a fluid.
 
-It has no reward of its own here but the paper's: the squared error of velocity, and a cost of torque.
+The reward is the paper's: the squared error of velocity, and a cost of torque.
 """
 
 from __future__ import annotations
@@ -23,5 +23,5 @@ class Swimmer(Planar):
     places = 2
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """-(v_x - 2)^2 - 1e-4 |a|^2."""
+        """Return -(v_x - 2)^2 - 1e-4 |a|^2."""
         return -(obs[..., 3] - 2.0).square() - 1e-4 * action.square().sum(-1)

@@ -1,6 +1,6 @@
 """Walker of guided policy search (Levine and Koltun 2013, appendix B): two legs walk in the plane y = 0.
 
-It has no reward of its own here but the paper's: squared errors of velocity and height, and a cost of torque.
+The reward is the paper's: squared errors of velocity and height, and a cost of torque.
 """
 
 from __future__ import annotations
@@ -22,6 +22,6 @@ class Walker(Planar):
     spread = (0.1,) * 18
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """-(v_x - 1.2)^2 - 10 (height - 1.4)^2 - 1e-4 |a|^2."""
+        """Return -(v_x - 1.2)^2 - 10 (height - 1.4)^2 - 1e-4 |a|^2."""
         cost = (obs[..., 8] - 1.2).square() + 10.0 * obs[..., 0].square()
         return -cost - 1e-4 * action.square().sum(-1)

@@ -15,7 +15,6 @@ from torch import Tensor
 from diffsim.env import DiffEnv
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.training.monitor import apart
 
 HORIZONS = (8, 32)  # control steps of the gradients
 SPANS = (0.1, 0.5)  # s after which states are compared
@@ -104,3 +103,12 @@ class Motion:
             mujoco.mj_forward(model, data)
             rows.append(data.energy[1])
         return np.reshape(rows, (-1, len(self.qpos)))
+
+
+def apart(model: mujoco.MjModel, found: Tensor, expected: Tensor) -> NDArray[np.float64]:
+    """(N,) root mean square over degrees of freedom [m, rad] between states (N, nq) and (N, nq)."""
+    away, errors = np.zeros(model.nv), []
+    for one, other in zip(found.double().cpu().numpy(), expected.double().cpu().numpy(), strict=True):
+        mujoco.mj_differentiatePos(model, away, 1.0, other, one)
+        errors.append(np.sqrt(np.mean(away**2)))
+    return np.array(errors)

@@ -26,7 +26,7 @@ from diffsim import startup
 from diffsim.extra import commands as command
 from diffsim.extra.drive import serve as drive
 from diffsim.extra.drive.serve import Handler, Pilot, Server, Stage, Wish
-from diffsim.extra.terrain import step
+from diffsim.extra.terrain import step, uneven
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.ant import Ant
 from diffsim.tasks.base import ASSETS
@@ -237,6 +237,8 @@ def test_the_ant_turns_to_where_it_is_sent():
         ("drive nothing", "unknown task 'nothing': choose from cartpole, hopper"),
         ("drive go1", "no policy for go1 is shipped; there are: "),
         ("drive go1 --checkpoint {go2}", "go2.pt is a checkpoint of go2, not of go1"),
+        ("drive go1:rough=20 --checkpoint {go2}", "a policy that was trained on go2, not on go1:rough=20"),
+        ("drive go2:rough=50", "'rough=50': the steepest slope must be above 0 and at most 45 degrees"),
         (
             "drive go2 --port {taken}",
             "cannot listen on 127.0.0.1:{taken}: Address already in use; choose another",
@@ -248,6 +250,18 @@ def test_the_ant_turns_to_where_it_is_sent():
 def test_mistakes_are_one_line(arguments, message, stage, capsys):
     names = {"go2": str(command.shipped("go2")), "taken": stage[1]}
     assert message.format(**names) in refusal(lambda: command.main(arguments.format(**names).split()), capsys)
+
+
+def test_options_of_the_task_and_of_the_training_count(tmp_path, monkeypatch):
+    state, served = torch.load(command.shipped("go2"), weights_only=True), []
+    torch.save(state | {"args": state["args"] | {"env": "go2:rough=10"}}, path := tmp_path / "checkpoint.pt")
+    monkeypatch.setattr(drive, "serve", lambda env, *_: served.append(env.scene.terrain))
+    for words in ("go2", "go2:rough=20", f"go2 --checkpoint {path}", f"go2:rough=20 --checkpoint {path}"):
+        command.main(["drive", *words.split()])
+    plane, *hills = served
+    assert plane is None
+    for terrain, slope in zip(hills, (20.0, 10.0, 20.0), strict=True):
+        np.testing.assert_array_equal(terrain, uneven(slope, 1))
 
 
 @pytest.mark.slow

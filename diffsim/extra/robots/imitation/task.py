@@ -18,7 +18,7 @@ STRAY = 0.5  # m; the episode ends when the root is further from the reference's
 
 
 def draw(rand: Tensor, count: int) -> Tensor:
-    """An int64 (...) below count from rand (..., 1): any alike, the first one if rand is 0.5."""
+    """Draw an int64 (...) below count from rand (..., 1): uniform; rand = 0.5 gives the first."""
     return ((rand[..., 0] + 0.5).remainder(1.0) * count).long().clamp(max=count - 1)
 
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from learners import stopped
 from scenes import task_scene
 from torch import Tensor
 
@@ -321,7 +322,8 @@ def test_checkpoints_hold_the_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     clip, run, there = read_clip(file), tmp_path / "run", str(tmp_path / "run" / "checkpoint.pt")
     flags = f"--env humanoid_imitation:{file} --num-envs 4 --horizon 2 --minibatch-size 4 --eval-episodes 2"
     options = [*flags.split(), "--device", "cpu", "--quiet", "--iterations", "2", "--run-dir", str(run)]
-    ppo_baseline.main([*options, "--stop-after", "1"])
+    with stopped(1):
+        ppo_baseline.main(options)
     assert f'"env": "humanoid_imitation:{file}"' in (run / "args.json").read_text()
     file.unlink()
     with pytest.raises(ValueError, match="no such clip"):
@@ -334,9 +336,7 @@ def test_checkpoints_hold_the_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         env = make_policy_env(load_policy(path), 2)
         assert isinstance(env.task, HumanoidImitation) and env.task.clip == clip and str(env.task.clip) == "mine"
     tasks._restored.clear()
-    ppo_baseline.main(
-        ["--evaluate", there, "--no-finer", "--eval-episodes", "2", "--run-dir", str(tmp_path / "evaluation")]
-    )
+    ppo_baseline.main(["--evaluate", there, "--eval-episodes", "2", "--run-dir", str(tmp_path / "evaluation")])
     env = make_policy_env(load_policy(there), 1, env="humanoid_imitation:humanoid_run")  # tracked as well
     assert env.task.clip == read_clip("humanoid_run")  # type: ignore[attr-defined]
     name = "humanoid_imitation:humanoid_run"

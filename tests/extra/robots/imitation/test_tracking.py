@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from learners import stopped
 from scenes import task_scene
 from torch import Tensor
 
@@ -283,10 +284,11 @@ def test_a_run_goes_on_with_a_shorter_clip_by_new_episodes(tmp_path: Path) -> No
     """Those of the checkpoint stand on frames that it lacks."""
     clip = str(write_csv(tmp_path / "short.csv", sway(2, 30)))
     flags = "--env g1_track:randomise=none --num-envs 8 --horizon 1 --minibatch-size 8 --eval-episodes 2 --eval-every 0"
-    words = [*flags.split(), "--device", "cpu", "--quiet", "--iterations", "2", "--stop-after", "1"]
-    ppo_baseline.main([*words, "--run-dir", str(tmp_path)])
+    words = [*flags.split(), "--device", "cpu", "--quiet", "--iterations", "2"]
+    with stopped(1):
+        ppo_baseline.main([*words, "--run-dir", str(tmp_path)])
     assert checkpoint.load(path := tmp_path / "checkpoint.pt")["ranks"][0]["env"]["memory"][:, 0].max() > 120
-    ppo_baseline.main(["--resume", str(tmp_path), "--env", f"g1_track:{clip}", "--stop-after", "2", "--quiet"])
+    ppo_baseline.main(["--resume", str(tmp_path), "--env", f"g1_track:{clip}", "--quiet"])
     state = checkpoint.load(path)
     assert state["iteration"] == 2 and state["ranks"][0]["env"]["memory"][:, 0].max() <= 120
     assert state["task"]["name"] == "short" and state["args"]["env"] == f"g1_track:{clip}"

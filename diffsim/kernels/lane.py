@@ -1,6 +1,6 @@
-"""The constants of the laws in one environment: the scene's, times the environment's own factors where they vary.
+"""Lane: a thread's part of an environment, and the environment's constants: the scene's times its own factors.
 
-Row e of the array `factors` has environment e's, in the order of FACTORS; the array has no columns where none vary.
+Row e of the array `factors` holds environment e's, in the order of FACTORS. The array has no columns if none vary.
 """
 
 from functools import cache
@@ -24,19 +24,19 @@ def lane_of(spec: KernelSpec) -> wp.Function:
 
     @wp.func
     def lane_of(m: Model, first: int, thread: int, h: T, factors: t.array2):
-        """What a thread computes in a launch from environment, or block, `first` on, and by which constants."""
+        """Make the Lane of a thread, in a launch from environment, or block, `first` on."""
         here = Lane()
         here.e = first + thread / THREADS_PER_ENV
         here.lane = thread % THREADS_PER_ENV
         here.at = here.lane * SLOTS
-        here.n = int(SLOTS)  # a variable, not a constant: Warp would unroll loops, and they outgrow a GPU's cache
+        here.n = int(SLOTS)  # a variable: Warp unrolls loops over constants, and they would outgrow a GPU's cache
         if wp.static(THREADS_PER_ENV > 1):
             here.n = m.count[here.lane]
         e = here.e
         here.h = h
         if wp.static(CONTACT and CONSTRAINED and VARIED):
-            here.k_n = read(factors, e, K_N)  # of the time constant's inverse square
-            here.k_d = read(factors, e, K_D)  # of D, and so of all of a contact's force for one motion
+            here.k_n = read(factors, e, K_N)  # factor of k, the inverse square of the time constant
+            here.k_d = read(factors, e, K_D)  # factor of D, and so of a contact's force at the same motion
             here.mu = read(factors, e, MU)
         if wp.static(CONTACT and not CONSTRAINED):
             here.k_n = T(m.k_n)
