@@ -121,7 +121,7 @@ def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
     [
         ("demo nothing", "unknown task 'nothing': choose from cartpole, hopper"),
         ("demo hopper", "no policy for hopper is shipped; there are: none"),
-        ("train nothing --env ant", "unknown learner 'nothing': choose from shac, sapo"),
+        ("train nothing --env ant", "unknown learner 'nothing': choose from bptt, gps, mbpo"),
         ("train", "Missing from diffsim train: {{shac,sapo,"),
         ("demo --nothing", "Unrecognized options: --nothing; For full helptext, run diffsim --help"),
         ("export {tmp}/nothing.pt {tmp}/new/out.pt", "no such checkpoint: {tmp}/nothing.pt"),
