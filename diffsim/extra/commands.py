@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import distributions, version
 from importlib.resources import files
 from pathlib import Path
+from typing import Annotated
 
 import torch
 import tyro
@@ -118,11 +119,11 @@ def drive(
         serve(make_policy_env(saved, 1, forces=True, env=own), saved.network, str(saved), host, port)
 
 
-def train(learner: Positional[str]) -> None:
+def train(learner: Annotated[Positional[str], tyro.conf.arg(metavar=f"{{{','.join(find_learners())}}}")]) -> None:
     """Train a policy, e.g. diffsim train shac --env ant; `diffsim train shac --help` lists the learner's flags.
 
     Args:
-        learner: the algorithm; an unknown one gives a list.
+        learner: the algorithm.
     """
 
 
