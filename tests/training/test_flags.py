@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
 import re
 import sys
@@ -27,6 +28,7 @@ import sac_baseline
 import sapo
 import shac
 import view
+from diffsim.extra.commands import find_learners
 from diffsim.extra.terrain import uneven
 from diffsim.training import checkpoint, errors, flags, parse, ranges
 from diffsim.training.evaluation import make_env
@@ -211,7 +213,7 @@ def test_ends_of_ranges_are_within(arguments):
     parse(shac.Args, ["--env", "cartpole", *arguments.split()])
 
 
-@pytest.mark.parametrize("script", [*SCRIPTS.values(), gps, mbpo, pfpn_sac, pods, sac_baseline])
+@pytest.mark.parametrize("script", [importlib.import_module(name) for name in find_learners()])
 def test_every_number_has_a_range(script):
     """But the seed, and pods.py's order, of which there are two."""
     for name, hint in get_type_hints(script.Args, include_extras=True).items():
@@ -376,3 +378,9 @@ def test_help_shows_the_defaults_of_the_task_and_the_preset(capsys):
     assert (default(text, "--num-envs"), default(text, "--minibatch-size")) == ("256", "2048")
     path = save(parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"]))
     assert default(help_of(shac, capsys, "--resume", str(path)), "--gamma") == "0.9"
+
+
+@pytest.mark.parametrize("script", find_learners())
+def test_help_fits_on_a_screen(script: str) -> None:
+    shared, every = (dataclasses.fields(kind) for kind in (flags.Flags, importlib.import_module(script).Args))
+    assert len(shared) <= 21 and len(every) - len(shared) <= (15 if script == "shac" else 20)
