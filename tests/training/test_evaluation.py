@@ -148,5 +148,5 @@ def test_a_run_ends_with_the_return_at_finer_substeps(
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "retained" in line]
     written = json.loads((tmp_path / "evaluation.json").read_text())
     shac.main(["--evaluate", str(tmp_path)])
-    assert line in capsys.readouterr().out and line.startswith("semi_implicit with 16 substeps: return median ")
+    assert line in capsys.readouterr().out and line.startswith("16 substeps: return median ")
     assert json.loads((tmp_path / "evaluation.json").read_text()) == written and written["finer"]["substeps"] == 16
