@@ -25,20 +25,17 @@ import common
 import tables
 from tables import ROOT
 
+from diffsim.extra.commands import find_learners
 from diffsim.training import fail
 
-CASES = {  # small trainings
-    # each learner
-    "shac": "shac --env hopper --num-envs 16",
-    "sapo": "sapo --env hopper --num-envs 16",
+CASES = {name: f"{name} --env hopper --num-envs 16" for name in find_learners()}  # small trainings
+CASES |= {  # learners that need other flags
     "population": "sapo --env hopper --population 2 --num-envs 16",
-    "bptt": "bptt --env hopper --num-envs 16",
     "pods": "pods --env cartpole --num-envs 16",
     "ppo_baseline": "ppo_baseline --env hopper --minibatch-size 512 --num-envs 16",
     "sac_baseline": "sac_baseline --env hopper --num-envs 16 --seed-steps 32",
     "mbpo": "mbpo --env hopper --num-envs 16 --seed-steps 16 --model-updates 4 --updates 4 --sample-enhance 1",
     "pfpn": "pfpn --env hopper --minibatch-size 512 --num-envs 16",
-    "pfpn_sac": "pfpn_sac --env hopper --num-envs 16",
     "gps": "gps --env cartpole --samples 4 --guiding-samples 4 --active 8 --horizon 20 --ilqr-iterations 2",
     # the physics and the tasks
     "cartpole": "shac --env cartpole --num-envs 16",
