@@ -21,9 +21,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
+from diffsim.extra.learning.likeliest import Likeliest
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments
+from diffsim.training.layers import ObsNormalizer, mlp, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import AtLeast2, Bounds, Count, Decay, Fraction, NonNegative, Positive, SomeWidths, UpTo10k
 

@@ -23,10 +23,11 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.learning.ensemble import Ensemble
+from diffsim.extra.learning.likeliest import Likeliest
 from diffsim.extra.learning.replay import ReplayBuffer, Transition
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import Likeliest, ObsNormalizer, mlp
+from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import AtLeast2, Batch, Count, Decay, Fraction, NonNegative, Positive, SomeWidths, UpTo10k
 

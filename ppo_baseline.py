@@ -20,9 +20,10 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.mirror import Mirror
+from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
 from diffsim.training import Run, distributed, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import ObsNormalizer, make_symmetric, mirror_inputs, mirror_outputs, mlp, moments
+from diffsim.training.layers import ObsNormalizer, mlp, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Bounds, Count, Finite, Fraction, Natural, NonNegative, Positive, UpTo10k, Widths
 
@@ -108,13 +109,13 @@ class ActorCritic(nn.Module):
 
     def make_alike(self, mirror: Mirror) -> None:
         """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
-        self.normalizer.mirror = mirror.obs
+        mirror_statistics(self.normalizer, mirror.obs)
         for features in (self.features, self.own):
             if features is not None:
                 mirror_inputs(features, mirror.obs)
         mirror_outputs(self.mean, mirror.action)
         mirror_outputs(self.value, mirror.value)
-        make_symmetric(self, "log_std", mirror.action)
+        mirror_parameter(self, "log_std", mirror.action)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""

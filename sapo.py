@@ -21,10 +21,11 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
 from diffsim.extra.learning.ensemble import Ensemble, EnsembleAdam
+from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
 from diffsim.tasks import TASKS
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import ObsNormalizer, make_symmetric, mirror_inputs, mirror_outputs, mlp
+from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.ranges import Count, Finite, Fraction, NonNegative, Positive, SomeWidths, UpTo10k, UpTo1000
 
 # SHAC's networks, and the settings of the best results (docs/sapo.md).
@@ -209,13 +210,13 @@ class SAPO:
     def make_alike(self) -> None:
         """Treat left and right alike: mirrored states get mirrored actions with the same noise, and the same value."""
         mirror, actor = self.env.task.mirror, self.actor
-        actor.normalizer.mirror = mirror.obs
+        mirror_statistics(actor.normalizer, mirror.obs)
         for inputs in (actor.body, self.critics):
             mirror_inputs(inputs.layers, mirror.obs)
         outputs = [(actor.mean, mirror.action), (self.critics, mirror.value)]
         for network, output in outputs + ([(actor.spread, mirror.size)] if actor.spread else []):
             mirror_outputs(network.layers, output)
-        make_symmetric(actor, "log_std", mirror.action)
+        mirror_parameter(actor, "log_std", mirror.action)
 
     @property
     def optimizers(self) -> tuple[EnsembleAdam, ...]:
