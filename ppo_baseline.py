@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.extra.mirror import Mirror
 from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
-from diffsim.training import Run, distributed, script
+from diffsim.training import Run, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp, moments
 from diffsim.training.optimizer import ClippedAdam
@@ -164,7 +164,7 @@ class PPO:
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, MAX_GRAD_NORM, lr=args.lr)
-        self.minibatches = math.ceil(args.horizon * env.num_envs / args.minibatch_size * distributed.size())
+        self.minibatches = math.ceil(args.horizon * args.num_envs / args.minibatch_size)
 
     def iterate(self) -> dict[str, Tensor]:
         """Act for a rollout, and descend the clipped loss on its samples; returns metrics.
@@ -209,7 +209,7 @@ class PPO:
                 b = Batch(*tensors)
                 mean, value = policy(b.obs)
                 kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
-                adapt(optimizer.lr, distributed.average(kl), TARGET_KL, args.lr_bounds)
+                adapt(optimizer.lr, optimizer.average(kl), TARGET_KL, args.lr_bounds)
                 ratio = log_ratio(b, mean, policy.log_std, old_log_std).exp()
                 policy_loss = clipped_loss(ratio, b.advantage, CLIP)
                 value_loss = (value - b.target).square().mean()

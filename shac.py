@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, mlp
 from diffsim.training.ranges import Count, Fraction, LogStd, Natural, NonNegative, Positive, UpTo10k, Widths
@@ -102,7 +102,7 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        if self.critic_minibatches > (samples := self.num_envs * self.horizon // distributed.size()):
+        if self.critic_minibatches > (samples := self.num_envs * self.horizon):
             fail(f"--critic-minibatches {self.critic_minibatches} are more than the {samples} samples of a rollout")
 
 

@@ -5,7 +5,6 @@ The physics knows nothing of this package.
 
 from __future__ import annotations
 
-from diffsim.training import distributed
 from diffsim.training.checkpoint import Learner, SavedPolicy, load_policy
 from diffsim.training.errors import UsageError, fail
 from diffsim.training.evaluation import Evaluation, evaluate, evaluate_checkpoint, make_policy_env
