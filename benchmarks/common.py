@@ -18,9 +18,10 @@ from tables import ROOT, Row
 
 from diffsim import DiffEnv
 from diffsim.extra.variation import on_a_plane
+from diffsim.extra.watch import make_policy_env
 from diffsim.sim.options import check_device
 from diffsim.tasks import TaskError, find_task
-from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy, make_policy_env
+from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy
 from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
 

@@ -18,7 +18,8 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.extra.planning import LinearGaussian, System, save_demonstration
-from diffsim.training import Evaluation, evaluate, load_policy, make_policy_env, parse
+from diffsim.extra.watch import make_policy_env
+from diffsim.training import Evaluation, evaluate, load_policy, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from gps import log_mixture, phi, sparse

@@ -124,7 +124,8 @@ SCREEN = Screen()
 
 
 def say(text: object) -> None:
-    SCREEN.write(f"{text}\n")
+    """Print a line, above the progress bar if there is one."""
+    tqdm.write(str(text), file=SCREEN)
 
 
 class ProgressLog:
@@ -154,10 +155,6 @@ class ProgressLog:
         self.bar.update(iteration - self.bar.n)
         if "charts/episodic_return" in scalars:
             self.bar.set_postfix_str(f"return {scalars['charts/episodic_return']:.1f}", refresh=False)
-
-    def message(self, text: str) -> None:
-        if not self.quiet:
-            tqdm.write(text, file=SCREEN)
 
     def close(self) -> None:
         if self.bar is not None:

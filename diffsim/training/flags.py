@@ -54,8 +54,6 @@ class Flags:
     """checkpoint, or directory of a run, to continue with its arguments unless the command line gives others"""
     evaluate: Path | None = None
     """checkpoint, or directory of a run, to evaluate, e.g. with more --substeps; writes evaluation.json to --run-dir"""
-    track: bool = False
-    """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
     """no progress bar, and no messages until the end"""
     contact: Contact = "soft"

@@ -256,10 +256,8 @@ class Run:
         self.message(f"iteration {self.iteration}: {evaluation}")
 
     def message(self, text: str) -> None:
-        """Print a line above the progress bar, unless --quiet."""
-        if self._log is not None:
-            self._log.message(text)
-        elif self.writes and not self.args.quiet:
+        """Print a line, unless --quiet."""
+        if self.writes and not self.args.quiet:
             say(text)
 
     def _end_iteration(self) -> None:
@@ -313,11 +311,6 @@ class Run:
         existing = path / "checkpoint.pt"
         if existing.exists() and (args.resume is None or not args.resume.samefile(existing)):
             fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
-        if args.track:
-            try:
-                import wandb  # noqa: F401
-            except ImportError:
-                fail("--track needs Weights & Biases: pip install wandb")
 
     def _open(self) -> None:
         """Begin to write and to receive signals, once."""
@@ -333,11 +326,6 @@ class Run:
         arguments = dataclasses.asdict(args)
         with self._writing():
             (directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
-            if args.track:
-                import wandb
-
-                options = dict(name=directory.name, dir=directory, config=arguments, sync_tensorboard=True)
-                wandb.init(project="diffsim", **options)
             start = directory, self.iteration, self.control_steps
             self._log = ProgressLog(*start, arguments, args.iterations, args.quiet)
 

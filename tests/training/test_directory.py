@@ -16,6 +16,7 @@ from diffsim.training.directory import (
     ProgressFile,
     ProgressLog,
     check_writable,
+    say,
 )
 
 
@@ -103,7 +104,7 @@ def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: py
     log = ProgressLog(tmp_path, 0, 0, {"gamma": 0.99, "hidden": (64, 64)}, total=4, quiet=False)
     for k in range(1, 4):
         log.write(k, 10 * k, 0.12345 * k, {"losses/actor": 1 / 3, "charts/episodic_return": 12.34})
-    log.message("a line")
+    say("a line")
     log.close()
     rows = read_progress(tmp_path)
     assert [r["control_steps"] for r in rows] == ["10", "20", "30"]

@@ -14,7 +14,6 @@ import sys
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -332,21 +331,6 @@ def test_runs_without_a_directory_have_one_of_their_own(tmp_path, monkeypatch):
     name = "cartpole__bptt__1__1700000000"
     assert {path.name for path in Path("runs").iterdir()} == {name, f"{name}.2", f"{name}.3"}
     assert all(json.loads((path / "args.json").read_text())["run_dir"] == str(path) for path in Path("runs").iterdir())
-
-
-def test_track(tmp_path, monkeypatch, capsys):
-    calls = []
-    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **arguments: calls.append(arguments)))
-    run(bptt, tmp_path / "there", *TINY, "--iterations", 1, "--quiet", "--track")
-    (call,) = calls
-    assert (call["project"], call["name"], call["dir"]) == ("diffsim", "there", tmp_path / "there")
-    assert call["config"]["num_envs"] == 2 and call["sync_tensorboard"]
-
-    monkeypatch.setitem(sys.modules, "wandb", None)  # import fails
-    missing = tmp_path / "missing"
-    line = refusal(lambda: run(bptt, missing, *TINY, "--track"), capsys)
-    assert line == "script.py: --track needs Weights & Biases: pip install wandb"
-    assert not missing.exists()
 
 
 def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path, monkeypatch):
