@@ -105,8 +105,6 @@ class ClippedAdam:
         own, saved = self._state(), state["adam"][0]
         if {name: value.shape for name, value in saved.items()} != {name: value.shape for name, value in own.items()}:
             raise ValueError("the state of an optimizer")
-        if not bool(state["skipped"].isfinite()):
-            raise ValueError("the count of skipped updates")
         for name, value in own.items():
             value.copy_(saved[name])
         self.lr.copy_(state["lr"])

@@ -85,8 +85,6 @@ class Run:
             fail(f"{args.resume} was trained by {ranks} processes, not {processes}")
         if self.writes:
             self._check_directory()
-        if torch.get_default_dtype() != torch.float32:
-            fail(f"training computes in float32: torch's default dtype must be that, not {torch.get_default_dtype()}")
         args.device = distributed.choose_device(args.device)
         try:
             self.device = check_device(args.device)
