@@ -31,18 +31,7 @@ from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import (
-    AtLeast2,
-    Batch,
-    Count,
-    Fraction,
-    Natural,
-    Positive,
-    SomeWidths,
-    UpTo10k,
-    UpTo1000,
-    Widths,
-)
+from diffsim.training.ranges import Batch, Count, Fraction, Natural, Positive, SomeWidths, UpTo10k, Widths
 
 # Policies and values: as SAC's, from Table 3 of the SHAC paper. Rollout lengths: MBPO's released settings.
 # fmt: off
@@ -57,6 +46,7 @@ PER_TASK = {
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # fmt: on
 MAX_GRAD_NORM = 100.0  # gradients of large values reach it
+MODELS, ELITES = 7, 5  # networks of the ensemble; those that predict held-out transitions best make the rollouts
 MODEL_LR = 1e-3
 ENHANCE_SCALE = 0.2  # distance of added states, in root mean square changes of a control step, and of actions
 TAU = 0.005  # target critics <- (1 - tau) target critics + tau critics, after each update
@@ -81,10 +71,6 @@ class Args(Flags):
     """control steps of each environment with random actions before the first update"""
     buffer_size: Count = 1_000_000
     """real transitions in the replay buffer, over all environments"""
-    models: AtLeast2 = 7
-    """networks of the ensemble"""
-    elites: UpTo1000 = 5
-    """networks that make the rollouts: those that predict held-out transitions best"""
     model_hidden: Widths = (200, 200, 200, 200)
     """units of the models' hidden layers (per task)"""
     model_updates: UpTo10k = 50
@@ -128,7 +114,6 @@ class Args(Flags):
         wrong = {
             seeding: self.seed_steps > most,
             "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
-            f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
             f"--rollout-lengths {first} {last}: the first must not exceed the second": first > last,
             f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step": self.buffer_size < rows,
             f"{jacobians} states that do not hold the past, on which {self.env} depends": self.sample_enhance
@@ -175,11 +160,11 @@ class Models(nn.Module):
     def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
         super().__init__()
         size = obs_dim + 1
-        networks = [mlp(obs_dim + action_dim, args.model_hidden, 2 * size, nn.SiLU) for _ in range(args.models)]
+        networks = [mlp(obs_dim + action_dim, args.model_hidden, 2 * size, nn.SiLU) for _ in range(MODELS)]
         self.ensemble = Ensemble(networks)
         self.least, self.most = (nn.Parameter(torch.full((size,), bound)) for bound in LOG_VAR)
         self.target = ObsNormalizer(size)
-        self.elites: Tensor = nn.Buffer(torch.arange(args.elites))
+        self.elites: Tensor = nn.Buffer(torch.arange(ELITES))
         self.fits: Tensor = nn.Buffer(torch.zeros(()))  # iterations in which they learnt
 
     def forward(self, obs: Tensor, action: Tensor, which: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -231,7 +216,7 @@ class MBPO:
         self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.actor_lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
         self.model_optimizer = ClippedAdam(self.models, MAX_GRAD_NORM, lr=MODEL_LR)
-        imagined = args.retain * args.elites * args.branches * args.rollout_lengths[1]
+        imagined = args.retain * ELITES * args.branches * args.rollout_lengths[1]
         held_out = max(args.steps * self.held_out, args.buffer_size // HELD_OUT)
         buffers = (ReplayBuffer(size, obs_dim, action_dim) for size in (args.buffer_size, held_out, imagined))
         self.real, self.unseen, self.imagined = (buffer.to(env.device) for buffer in buffers)
@@ -274,10 +259,10 @@ class MBPO:
         """Descend each model's negative log likelihood, on samples of its own; then choose the elites."""
         args, models, losses = self.args, self.models, []
         for _ in range(args.model_updates):
-            batch = self.real.sample(args.models * args.model_batch_size)
+            batch = self.real.sample(MODELS * args.model_batch_size)
             target = models.target(changes(batch))
             each = (self.actor.normalizer(batch.obs), batch.action, target)
-            obs, action, target = (x.unflatten(0, (args.models, -1)) for x in each)
+            obs, action, target = (x.unflatten(0, (MODELS, -1)) for x in each)
             mean, log_var = models(obs, action)
             nll = 0.5 * ((target - mean).square() * (-log_var).exp() + log_var + math.log(2 * math.pi))
             width = (models.most - models.least).sum()
@@ -287,9 +272,9 @@ class MBPO:
         with torch.no_grad():
             batch = self.unseen.sample(HELD_OUT_BATCH)
             obs, action = self.actor.normalizer(batch.obs), batch.action
-            mean, _ = models(*(x.expand(args.models, *x.shape) for x in (obs, action)))
+            mean, _ = models(*(x.expand(MODELS, *x.shape) for x in (obs, action)))
             error = (mean - models.target(changes(batch))).square().mean(1)  # (models, obs_dim + 1)
-            models.elites.copy_(error.mean(1).topk(args.elites, largest=False).indices)
+            models.elites.copy_(error.mean(1).topk(ELITES, largest=False).indices)
             models.fits += 1
             chosen = error[models.elites].mean(0)
         found = {"models/train_nll": torch.stack(losses).mean(), "models/holdout_mse": chosen[:-1].mean()}
@@ -301,7 +286,7 @@ class MBPO:
         args, models = self.args, self.models
         least, most = args.rollout_lengths
         length = (least + (most - least) * (2 * models.fits / args.iterations).clamp(max=1.0)).floor()
-        obs = self.real.sample(args.elites * args.branches).obs
+        obs = self.real.sample(ELITES * args.branches).obs
         age = torch.zeros_like(obs[:, 0])
         for _ in range(most):
             order = torch.rand(len(obs), device=obs.device).argsort()  # each step another elite's

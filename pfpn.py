@@ -42,7 +42,8 @@ PER_TASK = {
 # fmt: on
 CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more of each
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation of a component
-MAX_GRAD_NORM, TARGET_KL, CLIP, VALUE_COEF, BOUND_COEF = 1.0, 0.008, 0.2, 2.0, 1e-4  # ppo_baseline.py's
+# As in ppo_baseline.py, where they are explained:
+MAX_GRAD_NORM, TARGET_KL, GAE_LAMBDA, CLIP, VALUE_COEF, BOUND_COEF = 1.0, 0.008, 0.95, 0.2, 2.0, 1e-4
 
 
 @dataclass
@@ -82,8 +83,6 @@ class Args(Flags):
     """smallest and largest learning rate; two equal numbers fix it"""
     gamma: Fraction = 0.99
     """discount factor"""
-    gae_lambda: Fraction = 0.95
-    """lambda of the advantage estimation"""
     epochs: UpTo10k = 5
     """passes over the samples of a rollout (per task)"""
     minibatch_size: Count = 8192
@@ -379,7 +378,7 @@ class PPO:
         rollout = Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
         mixture, next_value = self.actor(normalizer(rollout.next_obs))
         next_value = self.return_normalizer.inverse(next_value).masked_fill(rollout.terminated, 0.0)
-        target = td_lambda(rollout.reward, next_value, rollout.done, args.gamma, args.gae_lambda)
+        target = td_lambda(rollout.reward, next_value, rollout.done, args.gamma, GAE_LAMBDA)
         advantage = target - self.return_normalizer.inverse(rollout.value)
         explained = 1 - advantage.var() / target.var()
         self.return_normalizer.update(target)

@@ -46,6 +46,7 @@ BALANCING = {"g1_track": {"initial_log_std": -1.0}}  # more noise throws it over
 CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more of each
 MAX_GRAD_NORM = 1.0
 TARGET_KL = 0.008  # the learning rate falls if a minibatch's KL divergence is above twice this, rises below half of it
+GAE_LAMBDA = 0.95  # of the advantage estimation
 CLIP = 0.2  # the probability ratio counts only within 1 - CLIP and 1 + CLIP
 VALUE_COEF = 2.0  # weight of the value's squared error, in units of its standard deviation
 BOUND, BOUND_COEF = 1.1, 1e-4  # weight of the squared excess of the policy's mean, as actions are clipped at 1
@@ -65,8 +66,6 @@ class Args(Flags):
     """control steps H of a rollout (per task)"""
     gamma: Fraction = 0.99
     """discount factor"""
-    gae_lambda: Fraction = 0.95
-    """lambda of the advantage estimation"""
     hidden: Widths = (256, 128, 64)
     """units of the hidden layers, which policy and value share (per task)"""
     initial_log_std: Finite = 0.0
@@ -189,7 +188,7 @@ class PPO:
         value = self.return_normalizer.inverse(rollout.value)
         next_value = self.return_normalizer.inverse(policy(normalizer(rollout.next_obs))[1])
         next_value = next_value.masked_fill(rollout.terminated, 0.0)
-        advantage = gae(rollout.reward, value, next_value, rollout.done, args.gamma, args.gae_lambda)
+        advantage = gae(rollout.reward, value, next_value, rollout.done, args.gamma, GAE_LAMBDA)
         returns = value + advantage
         self.return_normalizer.update(returns)
         target, explained = self.return_normalizer(returns), 1 - advantage.var() / returns.var()

@@ -31,14 +31,14 @@ from diffsim.training.ranges import Batch, Count, Fraction, Natural, Positive, S
 
 # Table 3 of the SHAC paper; networks, seed steps, hopper and half_cheetah: its authors' released settings.
 # fmt: off
-COLUMNS = ("hidden", "num_envs", "batch_size", "temperature_lr", "actor_lr", "critic_lr", "seed_steps", "iterations")
+COLUMNS = ("hidden", "num_envs", "batch_size", "temperature_lr", "lr", "seed_steps", "iterations")
 PER_TASK = {
-    "cartpole":     ((64, 64),              32, 1024, 5e-3, 5e-4, 5e-4, 640,  4_000),
-    "hopper":       ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 5e-4, 640, 20_000),
-    "half_cheetah": ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 5e-4, 640, 20_000),
-    "ant":          ((256, 128, 64),       128, 4096, 5e-3, 5e-4, 5e-4, 640, 20_000),
-    "humanoid":     ((512, 256),            64, 2048, 2e-4, 3e-4, 3e-4, 256, 20_000),
-    "humanoid_mtu": ((512, 512, 512, 256), 256, 4096, 2e-4, 3e-4, 3e-4, 256, 40_000),
+    "cartpole":     ((64, 64),              32, 1024, 5e-3, 5e-4, 640,  4_000),
+    "hopper":       ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 640, 20_000),
+    "half_cheetah": ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 640, 20_000),
+    "ant":          ((256, 128, 64),       128, 4096, 5e-3, 5e-4, 640, 20_000),
+    "humanoid":     ((512, 256),            64, 2048, 2e-4, 3e-4, 256, 20_000),
+    "humanoid_mtu": ((512, 512, 512, 256), 256, 4096, 2e-4, 3e-4, 256, 40_000),
 }
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # fmt: on
@@ -87,12 +87,10 @@ class Args(Flags):
     """the target is the minimum of this many critics, drawn for each update"""
     layer_norm: bool = False
     """normalize the critics' hidden layers, which steadies many updates on large batches"""
-    critic_lr: Positive = 5e-4
-    """learning rate of the critics (per task)"""
     tau: Fraction = 0.005
     """target critics <- (1 - tau) target critics + tau critics, after each update"""
-    actor_lr: Positive = 5e-4
-    """learning rate of the actor (per task)"""
+    lr: Positive = 5e-4
+    """learning rate of actor and critics (per task)"""
     temperature_lr: Positive = 5e-3
     """learning rate of the temperature's logarithm (per task)"""
     large_batch: bool = False
@@ -160,8 +158,8 @@ class SAC:
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)  # the entropy's weight
         self.policy = self.actor.deterministic()
-        self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.actor_lr)
-        self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.critic_lr)
+        self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.lr)
+        self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
 
@@ -187,8 +185,7 @@ class SAC:
         return {
             **{name: torch.stack([row[name] for row in rows]).mean() for name in (rows[0] if rows else ())},
             "grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum(),
-            "charts/actor_lr": self.actor_optimizer.lr,
-            "charts/critic_lr": self.critic_optimizer.lr,
+            "charts/learning_rate": self.actor_optimizer.lr,
             "charts/temperature": self.temperature["log"].detach().exp(),
         }
 

@@ -60,7 +60,8 @@ ON_CPU: dict[str, dict[str, Any]] = {
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
 # fmt: on
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
-LAMBDA, MINIBATCHES = 0.95, 4  # of the value estimation; of a pass over a rollout's samples, contiguous in time
+GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
+MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
 MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of the optimizers; Adam's decay rates of the gradient's moments
 FINAL_LR = 1e-5  # the learning rates of actor and critics reach it, linearly, after the last iteration
 TEMPERATURE_LR = 5e-3  # of the temperature's logarithm
@@ -76,8 +77,6 @@ class Args(Flags):
     """parallel environments N, over all processes of torchrun (per task)"""
     horizon: Count = 32
     """control steps H of a rollout (per task)"""
-    gamma: Fraction = 0.99
-    """discount factor"""
     entropy: bool = True
     """the policy's entropy is part of the reward"""
     target_entropy: tuple[Finite, Finite] = (-0.5, -0.5)
@@ -264,7 +263,7 @@ class SAPO:
 
         # The actor's step along the gradient through targets, rewards, simulator and actor. K: each member's mean loss.
         next_values = self.next_values(rollout)
-        loss = actor_loss(reward, next_values.mean(0), rollout.done, args.gamma)
+        loss = actor_loss(reward, next_values.mean(0), rollout.done, GAMMA)
         gradient = self.actor_optimizer.gradient(K * loss)
         norm = self.actor_optimizer.step(gradient)
 
@@ -276,7 +275,7 @@ class SAPO:
 
         # Fit the critics to the soft TD(lambda) returns; the target critics follow.
         obs = rollout.obs.detach()
-        value = td_lambda(reward.detach(), next_values.detach().amin(0), rollout.done, args.gamma, LAMBDA)
+        value = td_lambda(reward.detach(), next_values.detach().amin(0), rollout.done, GAMMA, LAMBDA)
         critic_loss = self.fit_critics(self.split(normalizer(obs)), self.split(value))
         normalizer.update(obs)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):

@@ -32,8 +32,7 @@ FLAGS = {
     "pods": "--num-envs 5 --horizon 16 --candidates 3 --epochs 2 --batch-size 32 --order 2",
     "gps": "--horizon 30 --pretraining 20 --hidden 8 --samples 4 "
     "--guiding-samples 8 --active 16 --lbfgs-iterations 4 --adaptive 1 --adaptive-iterations 2",
-    "mbpo": f"{REPLAY} --seed-steps 8 --models 3 --elites 2 --model-hidden 16 16 --model-updates 3 --branches 20 "
-    "--updates 5",
+    "mbpo": f"{REPLAY} --seed-steps 8 --model-hidden 16 16 --model-updates 3 --branches 20 --updates 5",
     "sac_baseline": f"{REPLAY} --seed-steps 20",
 }
 COMPARED = ("modules", "ranks", "policy", "totals", "episodes", "iteration", "control_steps")

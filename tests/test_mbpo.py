@@ -50,9 +50,10 @@ def test_each_model_has_its_own_output_within_the_bounds() -> None:
     assert log_var.max() > 0.3 and log_var.min() < -9.5
 
 
-def test_elites_predict_and_no_others() -> None:
+def test_elites_predict_and_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the weights of all but the elites NaN, and each elite's mean its own constant."""
-    learner = build("--elites", "2")
+    monkeypatch.setattr(mbpo, "ELITES", 2)
+    learner = build()
     models = learner.models
     models.elites.copy_(torch.tensor([5, 2]))
     last = models.ensemble.layers[-1]
@@ -106,7 +107,8 @@ def test_a_linear_system_is_identified() -> None:
 
 
 def test_the_best_on_held_out_transitions_become_elites(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = learner_of("--elites 3 --model-updates 40")
+    monkeypatch.setattr(mbpo, "ELITES", 3)
+    learner = learner_of("--model-updates 40")
     for _ in range(5):
         learner.fit()
     last, step = learner.models.ensemble.layers[-1], learner.model_optimizer.step
@@ -141,7 +143,7 @@ def test_held_out_environments_are_not_learnt_from() -> None:
 
 def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Real states are -1; each step adds 1; what passes 2 has failed; the length rises over half of the iterations."""
-    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
+    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --retain 1")
     learner.real.rows[:, 0] = -1.0
     learner.env.task.terminated = lambda obs: obs[:, 0] > 2.5
     monkeypatch.setattr(learner.models, "predict", lambda obs, action: (torch.ones(250, 1), action[:, 0]))

@@ -461,7 +461,7 @@ def test_a_gaussian_is_trained_as_by_ppo_baseline(tmp_path: Path) -> None:
     torch.testing.assert_close(*weights, rtol=1e-3, atol=2e-5)
 
 
-SAME = {"actor_lr": "lr", "steps": "horizon", "updates_per_step": "epochs", "batch_size": "minibatch_size"}
+SAME = {"steps": "horizon", "updates_per_step": "epochs", "batch_size": "minibatch_size"}
 CONSTANTS = {"target_kl": "TARGET_KL", "clip_coef": "CLIP", "value_coef": "VALUE_COEF", "bound_coef": "BOUND_COEF"}
 CONSTANTS |= {"max_grad_norm": "MAX_GRAD_NORM"}
 

@@ -73,7 +73,7 @@ def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.testing.assert_close(rollout.action, mean + policy.log_std.exp() * noise)
 
     value, next_value = returns.inverse(value), returns.inverse(next_value).masked_fill(rollout.terminated, 0.0)
-    advantage = ppo.gae(rollout.reward, value, next_value, rollout.done, args.gamma, args.gae_lambda)
+    advantage = ppo.gae(rollout.reward, value, next_value, rollout.done, args.gamma, ppo.GAE_LAMBDA)
     returns.update(value + advantage)
     torch.testing.assert_close(batch.obs, normalizer(rollout.obs).flatten(0, 1))
     torch.testing.assert_close(batch.target, returns((value + advantage).flatten()), rtol=1e-4, atol=1e-5)

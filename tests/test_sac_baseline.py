@@ -51,7 +51,7 @@ def test_targets_and_losses(flags: str, subset: int | None, monkeypatch: pytest.
 
 def test_a_linear_quadratic_system_is_controlled() -> None:
     torch.manual_seed(0)
-    flags = "--actor-lr 3e-3 --critic-lr 3e-3 --temperature-lr 1e-12 --gamma 0.9 --tau 0.05"
+    flags = "--lr 3e-3 --temperature-lr 1e-12 --gamma 0.9 --tau 0.05"
     flags += " --hidden 32 32 --num-envs 16 --steps 8 --batch-size 128 --buffer-size 5000"
     learner = build(*flags.split(), env=Problem(16))
     learner.temperature["log"].data.fill_(math.log(0.1))

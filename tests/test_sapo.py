@@ -111,7 +111,8 @@ def test_without_its_additions_it_is_shac() -> None:
 
 def test_targets_take_the_least_critic_and_the_actor_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sapo, "LAMBDA", 1.0)
-    learner = build("cartpole", "--no-entropy", "--gamma", "0.5")
+    monkeypatch.setattr(sapo, "GAMMA", 0.5)
+    learner = build("cartpole", "--no-entropy")
     with torch.no_grad():
         for p in learner.targets.parameters():
             p.zero_()

@@ -149,8 +149,6 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp
         (sac_baseline, "--buffer-size 10", "--buffer-size 10 holds no iteration of 32 steps of 128"),
         (sac_baseline, "--tau 2", "--tau must be in [0, 1]"),
         (mbpo, "--seed-steps 64 --iterations 4", "--seed-steps 64 leave no update in --iterations 4: at most 63"),
-        (mbpo, "--models 1 --elites 1", "--models must be from 2 to 1,000, not 1"),
-        (mbpo, "--elites 8", "--elites 8 are more than --models 7"),
         (mbpo, "--num-envs 1", "--num-envs must be at least 2: one environment is held out"),
         (mbpo, "--rollout-lengths 3 2", "--rollout-lengths 3 2: the first must not exceed the second"),
         (mbpo, "--buffer-size 10", "--buffer-size 10 is less than the 64 transitions of a step"),
