@@ -38,6 +38,7 @@ DISTINCT_CASES = [
 # A free sphere of 2 kg; it falls, rolls, slides and rests.
 BALL = """
 <mujoco>
+  <option cone="elliptic"/>
   <custom>
     <numeric name="k_n" data="2e4"/> <numeric name="k_d" data="2e4"/> <numeric name="k_t" data="50"/>
     <numeric name="mu" data="0.5"/>

@@ -33,6 +33,9 @@ from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
 from diffsim.kernels.wide import blocks
 
+LEAST_FRICTION = 1e-5  # MuJoCo's, of a contact with friction
+UPRIGHT = 1e-9  # horizontal part of a capsule's unit vector, below which its contacts have the ground's frame
+
 
 @cache
 def constraint_law(spec: KernelSpec) -> SimpleNamespace:
@@ -40,7 +43,8 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     T, U, vec2, vec3, vec4, vec6, mat3 = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3
     Params, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
     Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
-    CarrierPos, Frame, ground, TERRAIN = t.CarrierPos, t.Frame, terrain_contact(spec), "terrain" in spec.features
+    CarrierPos, Frame, ground, FRAMED = t.CarrierPos, t.Frame, terrain_contact(spec), spec.framed
+    TERRAIN, PYRAMID, BOX = spec.has("terrain pyramid box")
     in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
@@ -67,7 +71,32 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(d / (rest * T(c[4])), slope / (d * rest), k * d * r, k * (d + slope * r))
 
     @wp.func
-    def cone_force(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
+    def edge_weights(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
+        """Return D of a pyramid's edges, and 1 for those that push, along x, -x, y and -y; all do where sticking is 1.
+
+        An edge's row is n + friction t. Without friction the four are one row, the normal's.
+        """
+        mu_sq = wp.max(friction, T(LEAST_FRICTION)) * wp.max(friction, T(LEAST_FRICTION))
+        edge = T(0.5) * D / (mu_sq * inv_impratio * (T(1.0) + mu_sq))
+        active = vec4()
+        for k in range(4):
+            slip = friction * jar[k / 2] * T(1 - 2 * (k % 2))
+            active[k] = wp.max(sticking, pick(jar[2] + slip, T(0.0), T(1.0), T(0.0)))
+        return pick(T(0.0), friction, edge, T(0.25) * D), active
+
+    @wp.func
+    def pyramid_force(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
+        """Return what elliptic_force does, of MuJoCo's pyramid: its four edges are one-sided rows."""
+        edge, s = edge_weights(D, friction, inv_impratio, jar, sticking)
+        x = friction * (s[0] - s[1])
+        y = friction * (s[2] - s[3])
+        xx = friction * friction * (s[0] + s[1])
+        yy = friction * friction * (s[2] + s[3])
+        H = edge * mat3(xx, T(0.0), x, T(0.0), yy, y, x, y, s[0] + s[1] + s[2] + s[3])
+        return -(H * jar), H
+
+    @wp.func
+    def elliptic_force(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
         """Return a contact's force, and H, minus its derivatives in jar.
 
         Where sticking is 1, the zone is MuJoCo's quadratic one, whatever jar is.
@@ -93,7 +122,17 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return f, H
 
     @wp.func
-    def friction_derivative(D: T, friction: T, inv_impratio: T, jar: vec3, w: vec3):
+    def pyramid_friction_derivative(D: T, friction: T, inv_impratio: T, jar: vec3, w: vec3):
+        """Return w . df / d friction."""
+        f, H = pyramid_force(D, friction, inv_impratio, jar, T(0.0))
+        mu_sq = friction * friction
+        weight = -(T(2.0) + T(4.0) * mu_sq) / (friction * (T(1.0) + mu_sq)) * wp.dot(f, w)  # by D of the edges
+        across = H[0, 0] * jar[0] * w[0] + H[1, 1] * jar[1] * w[1]
+        mixed = H[0, 2] * (jar[0] * w[2] + jar[2] * w[0]) + H[1, 2] * (jar[1] * w[2] + jar[2] * w[1])
+        return pick(T(0.0), friction, weight - (T(2.0) * across + mixed) / friction, T(0.0))
+
+    @wp.func
+    def elliptic_friction_derivative(D: T, friction: T, inv_impratio: T, jar: vec3, w: vec3):
         """Return w . df / d friction, which is 0 outside the cone's zone."""
         slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
         quadratic = pick(slip, -friction * inv_impratio * jar[2], T(1.0), T(0.0))
@@ -106,6 +145,36 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         along = inv_slip * (jar[0] * w[0] + jar[1] * w[1])
         return change * w[2] + (Ds * over - friction * change) * along
 
+    cone_force, friction_derivative = elliptic_force, elliptic_friction_derivative
+    if PYRAMID:
+        cone_force, friction_derivative = pyramid_force, pyramid_friction_derivative
+
+    @wp.func
+    def capsule_heading(m: Model, c: int, link: Link, E: Frame):
+        """Return cosine and sine of a capsule's angle about E's normal, minus its slope, and 1; of others (1, 0, 0, 0).
+
+        The angle changes with a rotation of the link by (-slope cosine, -slope sine, 1) . rotation.
+        """
+        axis = in_frame(E, link.R * vec3(m.contact_axis[c]))
+        length = wp.sqrt(axis[0] * axis[0] + axis[1] * axis[1])
+        lies = pick(T(UPRIGHT), length, T(1.0), T(0.0))
+        if m.contact_radius[c] == U(0.0):
+            lies = T(0.0)
+        return vec4(
+            pick(T(0.0), lies, axis[0] / length, T(1.0)),
+            pick(T(0.0), lies, axis[1] / length, T(0.0)),
+            pick(T(0.0), lies, -axis[2] / length, T(0.0)),
+            lies,
+        )
+
+    @wp.func
+    def cone_frame(m: Model, c: int, link: Link, E: Frame):
+        """Return the frame in which the cone acts: two edges of a pyramid lie along a capsule, as in MuJoCo."""
+        if wp.static(PYRAMID):
+            head = capsule_heading(m, c, link, E)
+            E = E * mat3(head[0], -head[1], T(0.0), head[1], head[0], T(0.0), T(0.0), T(0.0), T(1.0))
+        return E
+
     @wp.func
     def locate_contact(m: Model, here: Lane, c: int, link: Link, carrier: CarrierPos):
         """Locate contact sphere c over the ground.
@@ -117,7 +186,12 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         reach = T(m.contact_radius[c] + m.contact_params[c][10])
         distance, E, curvature = ground.distance(m, here, c, centre, carrier, reach)
-        return centre, distance, pick(distance, T(m.contact_params[c][10]), T(1.0), T(0.0)), E, curvature
+        active = pick(distance, T(m.contact_params[c][10]), T(1.0), T(0.0))
+        if wp.static(BOX):  # of a box MuJoCo takes the corners of the lower half
+            if m.contact_radius[c] == U(0.0):
+                height = in_frame(E, link.R * vec3(m.contact_axis[c]))[2]
+                active = active * pick(T(0.0), height, T(0.0), T(1.0))
+        return centre, distance, active, E, curvature
 
     @wp.func
     def contact_constants(m: Model, here: Lane, c: int):
@@ -152,6 +226,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
                 s = c - first
                 centre, distance, active, E, _ = locate_contact(m, here, c, links[i], carrier)
+                E = cone_frame(m, c, links[i], E)
                 sticking = T(1.0) - active * contacts[s].active
                 contacts[s].active = active
                 if block.any_of(active):
@@ -165,7 +240,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     contacts[s].D = state[0]
                     contacts[s].f = f + H * (last_jar - jar)
                     contacts[s].H = H
-                    if wp.static(TERRAIN):
+                    if wp.static(FRAMED):
                         contacts[s].E = E
 
     @wp.func
@@ -177,7 +252,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 p = contacts[s].p
                 H = contacts[s].H
                 f = contacts[s].f
-                if wp.static(TERRAIN):
+                if wp.static(FRAMED):
                     f = contacts[s].E * f
                     H = contacts[s].E * H * wp.transpose(contacts[s].E)
                 PH = wp.skew(p) * H
@@ -216,7 +291,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             s = c - m.contact_begin[here.at]
             if block.any_of(contacts[s].active):
                 step_jar = point_velocity(step, contacts[s].p)
-                if wp.static(TERRAIN):
+                if wp.static(FRAMED):
                     step_jar = in_frame(contacts[s].E, step_jar)
                 if evaluation == 0:
                     contacts[s].Hs = contacts[s].H * step_jar
@@ -277,8 +352,9 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     ):
         """Add the contacts' part of phi to link k's adjoints."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, active, E, curvature = locate_contact(m, here, c, link, carrier)
+            centre, distance, active, feature, curvature = locate_contact(m, here, c, link, carrier)
             if block.any_of(active):
+                E = cone_frame(m, c, link, feature)
                 p, _, state, coef = contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
                 jar = vec3()
                 for r in range(3):
@@ -294,8 +370,14 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
                     adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
-                if wp.static(TERRAIN):  # adjoint of the frame's angle
-                    g_angle = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2]))[1] - wp.cross(f, w)[1]
+                if wp.static(FRAMED):  # adjoint of a rotation of the frame
+                    g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
+                if wp.static(PYRAMID):
+                    g_turn = in_frame(feature, in_world(E, g_turn))
+                    head = capsule_heading(m, c, link, feature)
+                    g_head = g_turn[2] * vec3(head[2] * head[0], head[2] * head[1], head[3])
+                    adj.p = adj.p + sp.join(in_world(feature, g_head), vec3())
+                    g_turn = g_turn - g_head
                 f = in_world(E, f)
                 g_jar = in_world(E, g_jar)
                 G = force_at(p, g_jar)
@@ -306,12 +388,12 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 adj.v = adj.v + coef[1] * G
                 adj.b = adj.b + G
                 # The point follows the sphere's centre, at half its speed along the normal, which turns with it.
-                g_p = in_frame(E, g_p)
+                g_p = in_frame(feature, g_p)
                 g_p[2] = T(0.5) * g_p[2] + g_r
                 if wp.static(TERRAIN):
                     arm = T(m.contact_radius[c]) + T(0.5) * distance
-                    g_p[0] = g_p[0] + curvature * (g_angle - arm * g_p[0])
-                adj.p = adj.p + force_at(centre, in_world(E, g_p))
+                    g_p[0] = g_p[0] + curvature * (g_turn[1] - arm * g_p[0])
+                adj.p = adj.p + force_at(centre, in_world(feature, g_p))
                 adj.p = (
                     adj.p + wp.spatial_cross_dual(coef[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
                 )

@@ -42,7 +42,9 @@ def constrained(scene: Scene, seconds: float) -> Scene:
         contact_link=scene.spheres.link,
         contact_position=scene.spheres.centre,
         contact_radius=scene.spheres.radius,
-        constraints=Constraints(np.array(contact).reshape(-1, 11), limit, np.array([(0.0, 1.0, 0.0), *loss])),
+        constraints=Constraints(
+            np.array(contact).reshape(-1, 11), scene.spheres.axis, limit, np.array([(0.0, 1.0, 0.0), *loss])
+        ),
     )
 
 
