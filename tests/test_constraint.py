@@ -201,10 +201,15 @@ def test_pairs_and_meshes_touch_as_in_mujoco(rng):
     check_step(scene, (qpos, 0.3 * qvel, ctrl), 1.0)
 
 
+IMPLICIT = 'integrator="implicitfast"/>'
+EXPLICIT = 'integrator="Euler"> <flag eulerdamp="disable"/> </option>'
+
+
+@pytest.mark.parametrize("option", [pytest.param(IMPLICIT, marks=SLOW), 'integrator="Euler"/>', EXPLICIT])
 @pytest.mark.parametrize("mjcf", [pytest.param(FREE_SERVOS, marks=SLOW), BOUNDED_SERVOS])
-def test_servos_are_damped_as_by_implicitfast(mjcf, rng):
-    """Their dampers are implicit, but where the force is at a bound."""
-    scene = parse(mjcf)
+def test_servos_are_damped_as_the_integrator_does(mjcf, option, rng):
+    """Euler takes joints' dampers implicitly, implicitfast those of servos, too, but where a force is at a bound."""
+    scene = parse(mjcf.replace(IMPLICIT, option))
     states = free_states(scene, 32, rng)
     check_step(scene, states, 1.0)
     check_gradients(scene, states, rng, enough=1.0)

@@ -69,7 +69,8 @@ class KernelSpec:
     @property
     def damped(self) -> bool:
         """Tell whether damping follows the constraints."""
-        return self.constrained and bool(self.features & {"damping", "base_damping"})
+        damping, base_damping, explicit = self.has("damping base_damping explicit_damping")
+        return self.constrained and (damping or base_damping) and not explicit
 
     @property
     def nfactor(self) -> int:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from diffsim.robot.contact import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
-from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, SceneError
+from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, SceneError, takes_euler
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
@@ -37,8 +37,14 @@ def constrained(scene: Scene, seconds: float) -> Scene:
             limit[link] = _numbers(m.jnt_solref[joint], m.jnt_solimp[joint], weight, m.jnt_margin[joint], fastest)
         k, b, _, _, _, d, *_ = _numbers(m.dof_solref[dof], m.dof_solimp[dof], weight, 0.0, fastest)
         loss.append((m.dof_frictionloss[dof], d / ((1 - d) * weight), b))
+    damping, servo_damping = scene.damping, scene.servo_damping
+    if takes_euler(m):  # which takes a servo's damping explicitly, and so apart from the joint's own
+        damping = np.append(0.0, m.dof_damping[first:])
+        servo_damping = servo_damping + scene.damping - damping
     return dataclasses.replace(
         scene,
+        damping=damping,
+        servo_damping=servo_damping,
         contact_link=scene.spheres.link,
         contact_position=scene.spheres.centre,
         contact_radius=scene.spheres.radius,

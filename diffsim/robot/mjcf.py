@@ -318,8 +318,8 @@ class _Reader:
         counts = [len(points) for points in centres[1:]]
         links = np.array([self.body[m.geom_bodyid[geom]][0] for geom in geoms], np.int32)
         geom_of = np.repeat(np.array(geoms, np.int32), counts)
-        at, radius = np.repeat(links, counts), np.repeat(radii, counts)
-        return Spheres(at, np.concatenate(centres), radius, geom_of, np.concatenate(directions))
+        each = np.repeat(links, counts), np.concatenate(centres), np.repeat(radii, counts)
+        return Spheres(*each, geom_of, np.concatenate(directions))
 
     def _outer(self, spheres: Spheres, slide: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Select, by link, spheres that are not inside another one in every pose: overlapping capsules count once."""

@@ -32,7 +32,7 @@ Row = tuple[str, ArrayLike | list[str], str]
 # Flags that the reader obeys, and flags that choose between MuJoCo's own numerical methods.
 OBEYED = {"constraint", "contact", "damper", "equality", "frictionloss", "gravity", "limit", "passive", "spring"}
 METHODS = {"autoreset", "clampctrl", "filterparent", "island", "midphase", "multiccd", "nativeccd", "refsafe", "sensor"}
-METHODS |= {"warmstart"}
+METHODS |= {"eulerdamp", "warmstart"}
 EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", "nativeccd", "sleep"}
 # Fields of a scene that may be infinite, and that are NaN where the file does not name them
 UNLIMITED, UNNAMED = {"lower", "upper", "force_low", "force_high"}, PENALTY_CONSTANTS

@@ -65,6 +65,11 @@ class Constraints(NamedTuple):
     loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
 
 
+def takes_euler(m: mujoco.MjModel) -> bool:
+    """Tell whether MuJoCo's constraints are stepped as by its Euler, and not as by its implicitfast."""
+    return m.opt.integrator in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
     """One articulated robot over the ground, in MuJoCo's conventions: SI units, z up.
@@ -177,7 +182,10 @@ class Scene:
     def features(self) -> frozenset[str]:
         """Return the features that the scene uses; the generated kernels contain no others."""
         limited, law = np.isfinite(self.lower) | np.isfinite(self.upper), self.constraints
-        pyramidal = self.mj_model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+        opt, disabled = self.mj_model.opt, mujoco.mjtDisableBit
+        pyramidal = opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+        euler, off = law is not None and takes_euler(self.mj_model), opt.disableflags & int(disabled.mjDSBL_EULERDAMP)
+        damped, servos = bool(self.damping.any() or self.base_damping.any()), bool(self.servo_damping.any())
         present = {
             "floating": self.floating,
             "hinge": bool((~self.slide & (self.ball < 0))[1:].any()),
@@ -192,8 +200,10 @@ class Scene:
             "gravcomp": bool(self.lift.any() and self.gravity.any()),
             "base_damping": bool(self.base_damping.any()),
             "stiffness": bool(self.stiffness.any()),
-            "damping": bool(self.damping.any() or self.servo_damping.any()),
-            "clamp": bool((np.isfinite(self.force_low) | np.isfinite(self.force_high)).any()),
+            "damping": bool(self.damping.any()) or servos,
+            "explicit_servos": euler and servos,
+            "explicit_damping": euler and (damped or servos) and bool(off or not damped),
+            "clamp": bool((np.isfinite(self.force_low) | np.isfinite(self.force_high)).any()) or servos,
             "motor": bool((self.motor_link > 0).any()),
             "muscle": len(self.segment_muscle) > 0,
             "drag": self.density > 0 or self.viscosity > 0,

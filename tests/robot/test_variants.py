@@ -119,7 +119,7 @@ VARIANTS = {
     ],
 }
 CASES = [(place, text) for place, texts in VARIANTS.items() for text in texts]
-REFUSED = 35
+REFUSED = 34
 
 
 def scene_of(place: str, text: str) -> Scene:
