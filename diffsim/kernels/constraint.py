@@ -1,4 +1,4 @@
-"""MuJoCo's regularised constraints: contact in the elliptic cone, joint limits and dry friction, and their adjoints.
+"""MuJoCo's regularised constraints: contact, joint limits and dry friction, and their adjoints.
 
 A row of MuJoCo's constraints has a force that depends on the acceleration a of the robot by
 
@@ -7,7 +7,7 @@ A row of MuJoCo's constraints has a force that depends on the acceleration a of 
 with v the row's velocity, r < 0 its violation of the margin, d(r) its impedance (`solimp`), k and b from `solref`, and
 w its inverse weight. J a - jar is MuJoCo's aref. MuJoCo leaves dJ/dt v out of J a. So J a is the velocity of the twists
 B that the links would have if the joints' velocities were their accelerations. A limit has the force -D jar where
-jar < 0, dry friction -D jar bounded by +-eta, a contact the three numbers of `cone_force`. All are linear in a within
+jar < 0, dry friction -D jar bounded by +-eta, a contact the three numbers of cone.py. All are linear in a within
 their zones, with slope -H. So a Newton step of MuJoCo's convex problem,
 
     (M + J'HJ) (a_new - a) = tau + J'f(a) - M a,
@@ -25,6 +25,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lane import K_D, K_N, MU
 from diffsim.kernels.model import functions, types
@@ -32,9 +33,6 @@ from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
 from diffsim.kernels.wide import blocks
-
-LEAST_FRICTION = 1e-5  # MuJoCo's, of a contact with friction
-UPRIGHT = 1e-9  # horizontal part of a capsule's unit vector, below which its contacts have the ground's frame
 
 
 @cache
@@ -45,6 +43,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
     CarrierPos, Frame, ground, FRAMED = t.CarrierPos, t.Frame, terrain_contact(spec), spec.framed
     TERRAIN, PYRAMID, BOX = spec.has("terrain pyramid box")
+    cone = pyramidal_cone(spec) if PYRAMID else elliptic_cone(spec)
     in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
@@ -69,111 +68,6 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         k = stiffness * T(c[0])
         rest = T(1.0) - d
         return vec4(d / (rest * T(c[4])), slope / (d * rest), k * d * r, k * (d + slope * r))
-
-    @wp.func
-    def edge_weights(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
-        """Return D of a pyramid's edges, and 1 for those that push, along x, -x, y and -y; all do where sticking is 1.
-
-        An edge's row is n + friction t. Without friction the four are one row, the normal's.
-        """
-        mu_sq = wp.max(friction, T(LEAST_FRICTION)) * wp.max(friction, T(LEAST_FRICTION))
-        edge = T(0.5) * D / (mu_sq * inv_impratio * (T(1.0) + mu_sq))
-        active = vec4()
-        for k in range(4):
-            slip = friction * jar[k / 2] * T(1 - 2 * (k % 2))
-            active[k] = wp.max(sticking, pick(jar[2] + slip, T(0.0), T(1.0), T(0.0)))
-        return pick(T(0.0), friction, edge, T(0.25) * D), active
-
-    @wp.func
-    def pyramid_force(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
-        """Return what elliptic_force does, of MuJoCo's pyramid: its four edges are one-sided rows."""
-        edge, s = edge_weights(D, friction, inv_impratio, jar, sticking)
-        x = friction * (s[0] - s[1])
-        y = friction * (s[2] - s[3])
-        xx = friction * friction * (s[0] + s[1])
-        yy = friction * friction * (s[2] + s[3])
-        H = edge * mat3(xx, T(0.0), x, T(0.0), yy, y, x, y, s[0] + s[1] + s[2] + s[3])
-        return -(H * jar), H
-
-    @wp.func
-    def elliptic_force(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
-        """Return a contact's force, and H, minus its derivatives in jar.
-
-        Where sticking is 1, the zone is MuJoCo's quadratic one, whatever jar is.
-        """
-        normal = jar[2]
-        slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
-        quadratic = wp.max(sticking, pick(slip, -friction * inv_impratio * normal, T(1.0), T(0.0)))
-        conical = wp.max(pick(normal, friction * slip, T(1.0), T(0.0)) - quadratic, T(0.0))
-        Dn = quadratic * D
-        Dt = Dn / inv_impratio
-        Ds = conical * D / (T(1.0) + friction * friction * inv_impratio)
-        over = normal - friction * slip
-        inv_slip = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
-        tx = inv_slip * jar[0]
-        ty = inv_slip * jar[1]
-        across = Dt - Ds * over * friction * inv_slip
-        along = Ds * friction * friction - (across - Dt)
-        nx = -Ds * friction * tx
-        ny = -Ds * friction * ty
-        xy = along * tx * ty
-        f = vec3(-across * jar[0], -across * jar[1], -Dn * normal - Ds * over)
-        H = mat3(across + along * tx * tx, xy, nx, xy, across + along * ty * ty, ny, nx, ny, Dn + Ds)
-        return f, H
-
-    @wp.func
-    def pyramid_friction_derivative(D: T, friction: T, inv_impratio: T, jar: vec3, w: vec3):
-        """Return w . df / d friction."""
-        f, H = pyramid_force(D, friction, inv_impratio, jar, T(0.0))
-        mu_sq = friction * friction
-        weight = -(T(2.0) + T(4.0) * mu_sq) / (friction * (T(1.0) + mu_sq)) * wp.dot(f, w)  # by D of the edges
-        across = H[0, 0] * jar[0] * w[0] + H[1, 1] * jar[1] * w[1]
-        mixed = H[0, 2] * (jar[0] * w[2] + jar[2] * w[0]) + H[1, 2] * (jar[1] * w[2] + jar[2] * w[1])
-        return pick(T(0.0), friction, weight - (T(2.0) * across + mixed) / friction, T(0.0))
-
-    @wp.func
-    def elliptic_friction_derivative(D: T, friction: T, inv_impratio: T, jar: vec3, w: vec3):
-        """Return w . df / d friction, which is 0 outside the cone's zone."""
-        slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
-        quadratic = pick(slip, -friction * inv_impratio * jar[2], T(1.0), T(0.0))
-        conical = pick(jar[2], friction * slip, T(1.0), T(0.0)) - quadratic
-        inv_slip = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
-        mu2 = T(1.0) + friction * friction * inv_impratio
-        Ds = conical * D / mu2
-        over = jar[2] - friction * slip
-        change = Ds * (T(2.0) * friction * inv_impratio / mu2 * over + slip)  # of the normal force
-        along = inv_slip * (jar[0] * w[0] + jar[1] * w[1])
-        return change * w[2] + (Ds * over - friction * change) * along
-
-    cone_force, friction_derivative = elliptic_force, elliptic_friction_derivative
-    if PYRAMID:
-        cone_force, friction_derivative = pyramid_force, pyramid_friction_derivative
-
-    @wp.func
-    def capsule_heading(m: Model, c: int, link: Link, E: Frame):
-        """Return cosine and sine of a capsule's angle about E's normal, minus its slope, and 1; of others (1, 0, 0, 0).
-
-        The angle changes with a rotation of the link by (-slope cosine, -slope sine, 1) . rotation.
-        """
-        axis = in_frame(E, link.R * vec3(m.contact_axis[c]))
-        length = wp.sqrt(axis[0] * axis[0] + axis[1] * axis[1])
-        lies = pick(T(UPRIGHT), length, T(1.0), T(0.0))
-        if m.contact_radius[c] == U(0.0):
-            lies = T(0.0)
-        return vec4(
-            pick(T(0.0), lies, axis[0] / length, T(1.0)),
-            pick(T(0.0), lies, axis[1] / length, T(0.0)),
-            pick(T(0.0), lies, -axis[2] / length, T(0.0)),
-            lies,
-        )
-
-    @wp.func
-    def cone_frame(m: Model, c: int, link: Link, E: Frame):
-        """Return the frame in which the cone acts: two edges of a pyramid lie along a capsule, as in MuJoCo."""
-        if wp.static(PYRAMID):
-            head = capsule_heading(m, c, link, E)
-            E = E * mat3(head[0], -head[1], T(0.0), head[1], head[0], T(0.0), T(0.0), T(0.0), T(1.0))
-        return E
 
     @wp.func
     def locate_contact(m: Model, here: Lane, c: int, link: Link, carrier: CarrierPos):
@@ -226,7 +120,8 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
                 s = c - first
                 centre, distance, active, E, _ = locate_contact(m, here, c, links[i], carrier)
-                E = cone_frame(m, c, links[i], E)
+                if wp.static(PYRAMID):
+                    E = E * cone.frame(cone.heading(m, c, links[i].R, E))
                 sticking = T(1.0) - active * contacts[s].active
                 contacts[s].active = active
                 if block.any_of(active):
@@ -234,7 +129,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     last_jar = vec3()
                     for r in range(3):
                         last_jar[r] = pick(T(0.0), sticking, jar[r], contacts[s].jar[r])
-                    f, H = cone_force(state[0], coef[2], T(m.contact_params[c][3]), last_jar, sticking)
+                    f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), last_jar, sticking)
                     contacts[s].p = p
                     contacts[s].jar = jar
                     contacts[s].D = state[0]
@@ -297,7 +192,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     contacts[s].Hs = contacts[s].H * step_jar
                 jar = contacts[s].jar + alpha * step_jar
                 friction = contact_constants(m, here, c)[2]
-                f, H = cone_force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
+                f, H = cone.force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
                 force_error = contacts[s].f - alpha * contacts[s].Hs - f
                 w = T(m.contact_params[c][4])
                 accel_error = acceleration_for(force_error, w, H)
@@ -354,30 +249,32 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             centre, distance, active, feature, curvature = locate_contact(m, here, c, link, carrier)
             if block.any_of(active):
-                E = cone_frame(m, c, link, feature)
+                E = feature
+                if wp.static(PYRAMID):
+                    heading = cone.heading(m, c, link.R, feature)
+                    E = feature * cone.frame(heading)
                 p, _, state, coef = contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
                 jar = vec3()
                 for r in range(3):
                     jar[r] = kin.load(ck.a, here.row, 2 * NV + 3 * c + r, here.e)
-                f, H = cone_force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
+                f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
                 w = in_frame(E, point_velocity(node.W, p))
                 velocity = in_frame(E, point_velocity(link.V, p))
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
                 if wp.static(VARIED):
                     by_k = T(0.5) * coef[1] * wp.dot(g_jar, velocity) + g_jar[2] * state[2]
-                    by_mu = friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
+                    by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
                     adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
                     adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
                 if wp.static(FRAMED):  # adjoint of a rotation of the frame
                     g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
                 if wp.static(PYRAMID):
-                    g_turn = in_frame(feature, in_world(E, g_turn))
-                    head = capsule_heading(m, c, link, feature)
-                    g_head = g_turn[2] * vec3(head[2] * head[0], head[2] * head[1], head[3])
-                    adj.p = adj.p + sp.join(in_world(feature, g_head), vec3())
-                    g_turn = g_turn - g_head
+                    g_turn = cone.frame(heading) * g_turn
+                    g_heading = g_turn[2] * cone.heading_derivative(heading)
+                    adj.p = adj.p + sp.join(in_world(feature, g_heading), vec3())
+                    g_turn = g_turn - g_heading
                 f = in_world(E, f)
                 g_jar = in_world(E, g_jar)
                 G = force_at(p, g_jar)

@@ -18,6 +18,7 @@ from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, Sc
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
+MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precision still holds
 
 
 def constrained(scene: Scene, seconds: float) -> Scene:
@@ -39,8 +40,15 @@ def constrained(scene: Scene, seconds: float) -> Scene:
         loss.append((m.dof_frictionloss[dof], d / ((1 - d) * weight), b))
     damping, servo_damping = scene.damping, scene.servo_damping
     if takes_euler(m):  # which takes a servo's damping explicitly, and so apart from the joint's own
-        damping = np.append(0.0, m.dof_damping[first:])
+        damping = np.minimum(damping, np.append(0.0, m.dof_damping[first:]))
         servo_damping = servo_damping + scene.damping - damping
+    rows = np.array(contact).reshape(-1, 11)
+    for kind, constants, owner in (("geom", rows, scene.spheres.geom), ("joint", limit[1:], m.dof_jntid[first:])):
+        if len(beyond := np.unique(owner[(np.abs(constants) > MOST_NUMBER).any(1)])):
+            names = listed(label(m, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), each) for each in beyond.tolist())
+            raise SceneError(
+                f"{scene.name}: {kind} {names}: solref, solimp, friction or impratio is too large or small"
+            )
     return dataclasses.replace(
         scene,
         damping=damping,
@@ -48,9 +56,7 @@ def constrained(scene: Scene, seconds: float) -> Scene:
         contact_link=scene.spheres.link,
         contact_position=scene.spheres.centre,
         contact_radius=scene.spheres.radius,
-        constraints=Constraints(
-            np.array(contact).reshape(-1, 11), scene.spheres.axis, limit, np.array([(0.0, 1.0, 0.0), *loss])
-        ),
+        constraints=Constraints(rows, scene.spheres.axis, limit, np.array([(0.0, 1.0, 0.0), *loss])),
     )
 
 
