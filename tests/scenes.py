@@ -49,6 +49,9 @@ BALL = """
   </worldbody>
 </mujoco>"""
 
+# A capsule with pyramidal cones, which turn with it.
+BAR = BALL.replace('"sphere" size="0.1"', '"capsule" size="0.1 0.1"').replace("elliptic", "pyramidal")
+
 # One driven hinge on the world. Its laws are in the kernels even where they do nothing, so all such robots share them.
 ONE_HINGE = """
 <mujoco>

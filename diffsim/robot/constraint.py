@@ -19,6 +19,7 @@ from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, Sc
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
 MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precision still holds
+LEAST_SOFTNESS = 1e-6  # of a pyramid's edges, at which Newton's method fails in single precision
 
 
 def constrained(scene: Scene, seconds: float) -> Scene:
@@ -43,12 +44,8 @@ def constrained(scene: Scene, seconds: float) -> Scene:
         damping = np.minimum(damping, np.append(0.0, m.dof_damping[first:]))
         servo_damping = servo_damping + scene.damping - damping
     rows = np.array(contact).reshape(-1, 11)
-    for kind, constants, owner in (("geom", rows, scene.spheres.geom), ("joint", limit[1:], m.dof_jntid[first:])):
-        if len(beyond := np.unique(owner[(np.abs(constants) > MOST_NUMBER).any(1)])):
-            names = listed(label(m, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), each) for each in beyond.tolist())
-            raise SceneError(
-                f"{scene.name}: {kind} {names}: solref, solimp, friction or impratio is too large or small"
-            )
+    if found := list(_beyond_single_precision(scene, rows, limit[1:])):
+        raise SceneError(f"{scene.name}: {'; '.join(found)}")
     return dataclasses.replace(
         scene,
         damping=damping,
@@ -82,6 +79,21 @@ def _contact(m: mujoco.MjModel, ground: int, geom: int, fastest: float) -> Array
     numbers = _numbers(law.solref, law.solimp, weight, law.margin, fastest)
     numbers[2:4] = friction, 1 / m.opt.impratio
     return numbers
+
+
+def _beyond_single_precision(scene: Scene, contact: Array, limit: Array) -> Iterator[str]:
+    m, geom, joint = scene.mj_model, scene.spheres.geom, scene.mj_model.dof_jntid[scene.mj_model.nv - len(limit) :]
+    friction, end = contact[:, 2], contact[:, 5:7].max(1)
+    softness = 2 * friction**2 * (1 + friction**2) * contact[:, 3] * (1 - end) / end  # of a pyramid's edges
+    hard = (friction > 0) & (softness < LEAST_SOFTNESS) & (m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    for kind, elements, what in (
+        ("geom", geom[(np.abs(contact) > MOST_NUMBER).any(1)], "solref, solimp, friction or impratio is out of range"),
+        ("joint", joint[(np.abs(limit) > MOST_NUMBER).any(1)], "solreflimit or solimplimit is out of range"),
+        ("geom", geom[hard], "a pyramidal cone of so little friction, or large impratio, is too stiff; take condim 1"),
+    ):
+        if len(elements):
+            element = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+            yield f"{kind} {listed(label(m, element, each) for each in np.unique(elements).tolist())}: {what}"
 
 
 def _obstacles(scene: Scene) -> Iterator[str]:

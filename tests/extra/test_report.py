@@ -13,6 +13,8 @@ from diffsim.extra.commands import main
 from diffsim.extra.report import approximations, report
 from diffsim.robot.mjcf import load_scene
 
+LINK = '<body pos=".2 0 0"><joint axis="0 1 0"/><geom size=".02" pos=".1 0 0" contype="0" conaffinity="0"/></body>'
+
 
 def standing(root: str = "<freejoint/>", geom: str = "", option: str = "") -> str:
     return robot(f'<body pos="0 0 0.1">{root}<geom size="0.1" {geom}/></body>', f"<option {option}/>")
@@ -67,7 +69,7 @@ def test_command(tmp_path, capsys):
         (standing(option='noslip_iterations="9"'), "Left out: noslip_iterations. MuJoCo's steps change by "),
         (standing(option='integrator="RK4"'), "Left out: integrator RK4, simulated as Euler. MuJoCo's"),
         (
-            standing(option='integrator="implicit"'),
+            standing(f"<freejoint/>{LINK}", option='integrator="implicit"'),
             "Left out: integrator implicit, simulated as implicitfast. MuJoCo's",
         ),
         (
