@@ -29,23 +29,21 @@ def constrained(scene: Scene, seconds: float) -> Scene:
         raise SceneError(f"{scene.name}: on MuJoCo's contact {'; '.join(found)}")
     fastest = 0.0 if "refsafe" in disabled_flags(m) else 2 * seconds
     ground = ground_pairs(m)[0][0] if len(scene.spheres.geom) else 0
-    contact = [_contact(m, ground, geom, fastest) for geom in scene.spheres.geom.tolist()]
+    contact = [_contact(scene, ground, geom, fastest) for geom in scene.spheres.geom.tolist()]
     first = m.nv - scene.nlink + 1
     limit, loss = np.tile(_numbers((1.0, 1.0), (0.9, 0.9, 1.0, 0.5, 2.0), 1.0, 0.0), (scene.nlink, 1)), []
     for link, dof in enumerate(range(first, m.nv), start=1):
         joint, weight = m.dof_jntid[dof], m.dof_invweight0[dof]
         limit[link, 4] = weight
         if np.isfinite(scene.lower[link]):
-            limit[link] = _numbers(m.jnt_solref[joint], m.jnt_solimp[joint], weight, m.jnt_margin[joint], fastest)
+            numbers = _numbers(m.jnt_solref[joint], m.jnt_solimp[joint], weight, m.jnt_margin[joint], fastest)
+            limit[link] = _in_range(numbers, f"{scene.name}: joint {label(m, mujoco.mjtObj.mjOBJ_JOINT, joint)}")
         k, b, _, _, _, d, *_ = _numbers(m.dof_solref[dof], m.dof_solimp[dof], weight, 0.0, fastest)
         loss.append((m.dof_frictionloss[dof], d / ((1 - d) * weight), b))
     damping, servo_damping = scene.damping, scene.servo_damping
     if takes_euler(m):  # which takes a servo's damping explicitly, and so apart from the joint's own
         damping = np.minimum(damping, np.append(0.0, m.dof_damping[first:]))
         servo_damping = servo_damping + scene.damping - damping
-    rows = np.array(contact).reshape(-1, 11)
-    if found := list(_beyond_single_precision(scene, rows, limit[1:])):
-        raise SceneError(f"{scene.name}: {'; '.join(found)}")
     return dataclasses.replace(
         scene,
         damping=damping,
@@ -53,7 +51,9 @@ def constrained(scene: Scene, seconds: float) -> Scene:
         contact_link=scene.spheres.link,
         contact_position=scene.spheres.centre,
         contact_radius=scene.spheres.radius,
-        constraints=Constraints(rows, scene.spheres.axis, limit, np.array([(0.0, 1.0, 0.0), *loss])),
+        constraints=Constraints(
+            np.array(contact).reshape(-1, 11), scene.spheres.axis, limit, np.array([(0.0, 1.0, 0.0), *loss])
+        ),
     )
 
 
@@ -72,28 +72,25 @@ def check_soft(scene: Scene) -> None:
         )
 
 
-def _contact(m: mujoco.MjModel, ground: int, geom: int, fastest: float) -> Array:
+def _contact(scene: Scene, ground: int, geom: int, fastest: float) -> Array:
+    m = scene.mj_model
     law = pair_law(m, ground, geom)
     weight = m.body_invweight0[m.geom_bodyid[[ground, geom]], 0].sum()
     friction = max(law.friction, LEAST_FRICTION) if law.condim > 1 else 0.0
     numbers = _numbers(law.solref, law.solimp, weight, law.margin, fastest)
     numbers[2:4] = friction, 1 / m.opt.impratio
+    name, end = f"{scene.name}: geom {label(m, mujoco.mjtObj.mjOBJ_GEOM, geom)}", numbers[5:7].max()
+    edges = 2 * friction**2 * (1 + friction**2) / m.opt.impratio * (1 - end) / end
+    if m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and 0 < edges < LEAST_SOFTNESS:
+        raise SceneError(f"{name}: a pyramid of so little friction or large impratio is too stiff; take condim 1")
+    return _in_range(numbers, name)
+
+
+def _in_range(numbers: Array, what: str) -> Array:
+    """Return a row of constants; raises SceneError if single precision does not hold their squares."""
+    if not np.abs(numbers).max() < MOST_NUMBER:
+        raise SceneError(f"{what}: its solref, solimp, friction or impratio is out of range")
     return numbers
-
-
-def _beyond_single_precision(scene: Scene, contact: Array, limit: Array) -> Iterator[str]:
-    m, geom, joint = scene.mj_model, scene.spheres.geom, scene.mj_model.dof_jntid[scene.mj_model.nv - len(limit) :]
-    friction, end = contact[:, 2], contact[:, 5:7].max(1)
-    softness = 2 * friction**2 * (1 + friction**2) * contact[:, 3] * (1 - end) / end  # of a pyramid's edges
-    hard = (friction > 0) & (softness < LEAST_SOFTNESS) & (m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)
-    for kind, elements, what in (
-        ("geom", geom[(np.abs(contact) > MOST_NUMBER).any(1)], "solref, solimp, friction or impratio is out of range"),
-        ("joint", joint[(np.abs(limit) > MOST_NUMBER).any(1)], "solreflimit or solimplimit is out of range"),
-        ("geom", geom[hard], "a pyramidal cone of so little friction, or large impratio, is too stiff; take condim 1"),
-    ):
-        if len(elements):
-            element = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-            yield f"{kind} {listed(label(m, element, each) for each in np.unique(elements).tolist())}: {what}"
 
 
 def _obstacles(scene: Scene) -> Iterator[str]:

@@ -64,7 +64,7 @@ def test_command(tmp_path, capsys):
         ),
         (
             standing('<joint type="free" frictionloss="1"/>'),
-            "Left out: frictionloss of a free joint; <freejoint/> takes",
+            "Left out: frictionloss of a free joint (use <freejoint/>). MuJoCo's",
         ),
         (standing(option='noslip_iterations="9"'), "Left out: noslip_iterations. MuJoCo's steps change by "),
         (standing(option='integrator="RK4"'), "Left out: integrator RK4, simulated as Euler. MuJoCo's"),
