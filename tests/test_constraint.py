@@ -367,23 +367,24 @@ def check_gradients(scene, states, rng, optional=None, enough=0.5):
     states = [x[kept] for x in states]
     optional = {name: x[kept] for name, x in (optional or {}).items()}
     values = gradients(scene, states, w, optional=optional, **sim)
-    # Short steps drown in the solver's rounding, long ones cross from zone to zone: one of the two must agree.
-    expected = [differences(scene, states, w, optional, scale, **sim) for scale in (10.0, 100.0)]
+    # Short steps drown in the solver's rounding, long ones cross from zone to zone: one size must agree.
+    expected = [differences(scene, states, w, optional, scale, **sim) for scale in (1.0, 10.0, 100.0)]
     for name, value, *slopes in zip(("qpos", "qvel", "ctrl", *optional), values, *expected, strict=True):
         if slopes[0].size:
             wrong = [np.linalg.norm(value.reshape(s.shape) - s, axis=-1) / np.linalg.norm(s, axis=-1) for s in slopes]
-            assert np.minimum(*wrong).max() < 1e-6, f"gradient with respect to {name}: {np.minimum(*wrong)}"
+            assert np.min(wrong, axis=0).max() < 1e-6, f"gradient with respect to {name}: {np.min(wrong, axis=0)}"
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("base", ["floating", *(pytest.param(base, marks=SLOW) for base in BASES[1:])])
 def test_tree_gradient_is_that_of_differences(base, seed, rng):
     """In every zone of every law, and with factors of friction, time constants, mass and motors."""
-    scene, states = tree_states(base, seed, 16, rng)
+    n = 16 if seed == 0 else 32
+    scene, states = tree_states(base, seed, n, rng)
     assert in_mujoco(scene, *states)[2] == kinds_of_states(seed)
     check_gradients(scene, states, rng)
     if base in ("floating", "planar"):
-        check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (16, len(FACTORS)))})
+        check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (n, len(FACTORS)))})
 
 
 @pytest.mark.parametrize("name", ["hopper", "sphere", *(pytest.param(name, marks=SLOW) for name in ("ant", "ball"))])
