@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Protocol
 
 import torch
@@ -17,27 +18,26 @@ from torch import nn
 from diffsim.env import DiffEnv
 from diffsim.tasks import FILE, TASKS, base_name, restore_task
 from diffsim.training.errors import fail
-from diffsim.training.layers import First, Likeliest, MirrorMean, ObsNormalizer, WithMirrorImage
 
 POLICIES = Path(__file__).resolve().parents[1] / "policies"  # that come with the package
 FORMAT = 2
 POLICY = {"script", "args", "iteration", "policy"}  # what an exported policy has
 HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one
 
-# What a policy may consist of, and the attributes that its constructor takes.
-LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
-    "ELU": (nn.ELU, ()),
-    "First": (First, ("columns",)),
-    "LayerNorm": (nn.LayerNorm, ("normalized_shape",)),
-    "Likeliest": (Likeliest, ("actions", "components", "shared")),
-    "Linear": (nn.Linear, ("in_features", "out_features")),
-    "MirrorMean": (MirrorMean, ("size",)),
-    "ObsNormalizer": (ObsNormalizer, ("size",)),
-    "ReLU": (nn.ReLU, ()),
-    "SiLU": (nn.SiLU, ()),
-    "Softplus": (nn.Softplus, ()),
-    "Tanh": (nn.Tanh, ()),
-    "WithMirrorImage": (WithMirrorImage, ("size",)),
+# What a policy may consist of, where it is, and the attributes that its constructor takes.
+LAYERS = {
+    "ELU": ("torch.nn:ELU", ()),
+    "First": ("diffsim.training.layers:First", ("columns",)),
+    "LayerNorm": ("torch.nn:LayerNorm", ("normalized_shape",)),
+    "Likeliest": ("diffsim.extra.learning.likeliest:Likeliest", ("actions", "components", "shared")),
+    "Linear": ("torch.nn:Linear", ("in_features", "out_features")),
+    "MirrorMean": ("diffsim.extra.symmetry:MirrorMean", ("size",)),
+    "ObsNormalizer": ("diffsim.training.layers:ObsNormalizer", ("size",)),
+    "ReLU": ("torch.nn:ReLU", ()),
+    "SiLU": ("torch.nn:SiLU", ()),
+    "Softplus": ("torch.nn:Softplus", ()),
+    "Tanh": ("torch.nn:Tanh", ()),
+    "WithMirrorImage": ("diffsim.extra.symmetry:WithMirrorImage", ("size",)),
 }
 
 
@@ -149,7 +149,8 @@ def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
     state = load(path)
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
-            network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
+            layers = (resolve_name(LAYERS[name][0])(*arguments) for name, *arguments in state["policy"]["layers"])
+            network = nn.Sequential(*layers)
             kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
         weights = {name: w.to(kinds[name]) for name, w in state["policy"]["weights"].items()}  # searched in float64
         network.load_state_dict(weights, assign=True)

@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
@@ -26,11 +26,10 @@ COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_re
 def check_writable(directory: Path) -> None:
     """End the script if nothing can be written to a directory, which need not exist; leaves nothing behind."""
     try:
-        str(directory).encode()  # tensorboard writes it
         existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
         tempfile.TemporaryFile(dir=existing).close()
-    except (OSError, UnicodeError) as error:
-        fail(f"cannot write to run directory {directory}: {getattr(error, 'strerror', 'its name is not UTF-8')}")
+    except OSError as error:
+        fail(f"cannot write to run directory {directory}: {error.strerror}")
 
 
 def make_unused(wanted: Path) -> Path:
@@ -70,38 +69,33 @@ class ProgressFile:
 
     def __init__(self, path: Path, iteration: int) -> None:
         self.path, self.columns = path, list(COLUMNS)
-        self._begin(self._rows(iteration) if iteration > 0 else [])
+        self._replace(iteration)
 
-    def _rows(self, last: float = math.inf) -> list[dict[str, str]]:
-        """Up to an iteration. A crash may leave rows of later ones, and half of a line."""
-        if not self.path.is_file():
-            return []
-        with self.path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            self.columns = list(reader.fieldnames or COLUMNS)
-            return [row for row in reader if None not in row.values() and int(row["iteration"]) <= last]
+    def write(self, row: Mapping[str, float]) -> None:
+        new = [name for name in row if name not in self.columns]
+        if new or not self.path.is_file():  # someone may have moved it
+            self._replace(math.inf, new)
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, self.columns, restval="").writerow(row)
 
-    def _begin(self, rows: list[dict[str, str]]) -> None:
-        """Replace the file in one step, and go on at its end."""
+    def _replace(self, last: float, new: Sequence[str] = ()) -> None:
+        """Replace the file in one step: its rows up to an iteration, with new columns.
+
+        A crash may have left rows of later iterations, and half of a line.
+        """
+        rows = list[dict[str, str]]()
+        if last > 0 and self.path.is_file():
+            with self.path.open(newline="") as file:
+                reader = csv.DictReader(file)
+                self.columns = list(reader.fieldnames or COLUMNS)
+                rows = [row for row in reader if None not in row.values() and int(row["iteration"]) <= last]
+        self.columns += new
         temporary = self.path.with_suffix(".csv.tmp")
         with temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self.columns, restval="")
             writer.writeheader()
             writer.writerows(rows)
         os.replace(temporary, self.path)
-        self._file = self.path.open("a", newline="")
-
-    def write(self, row: Mapping[str, float]) -> None:
-        if new := [name for name in row if name not in self.columns]:
-            self._file.close()
-            rows = self._rows()
-            self.columns += new
-            self._begin(rows)
-        csv.DictWriter(self._file, self.columns, restval="").writerow(row)
-        self._file.flush()
-
-    def close(self) -> None:
-        self._file.close()
 
 
 def column(scalar: str) -> str:
@@ -124,7 +118,8 @@ SCREEN = Screen()
 
 
 def say(text: object) -> None:
-    SCREEN.write(f"{text}\n")
+    """Print a line, above the progress bar if there is one."""
+    tqdm.write(str(text), file=SCREEN)
 
 
 class ProgressLog:
@@ -155,14 +150,7 @@ class ProgressLog:
         if "charts/episodic_return" in scalars:
             self.bar.set_postfix_str(f"return {scalars['charts/episodic_return']:.1f}", refresh=False)
 
-    def message(self, text: str) -> None:
-        if not self.quiet:
-            tqdm.write(text, file=SCREEN)
-
     def close(self) -> None:
         if self.bar is not None:
             self.bar.close()
-        try:
-            self.tensorboard.close()
-        finally:
-            self.file.close()
+        self.tensorboard.close()

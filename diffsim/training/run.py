@@ -77,12 +77,15 @@ class Run:
 
     def __init__(self, args: Flags) -> None:
         self.args = args
-        self.writes = distributed.rank() == 0
+        self.writes, processes = distributed.rank() == 0, distributed.size()
+        if processes > 1 and not args.processes:
+            fail("this learner trains in one process: start it without torchrun")
         self._state = checkpoint.load(args.resume, args.script()) if args.resume else None
+        if self._state and (ranks := len(self._state["ranks"])) != processes:
+            fail(f"{args.resume} was trained by {ranks} processes, not {processes}")
         if self.writes:
             self._check_directory()
-        if torch.get_default_dtype() != torch.float32:
-            fail(f"training computes in float32: torch's default dtype must be that, not {torch.get_default_dtype()}")
+        args.device = distributed.choose_device(args.device)
         try:
             self.device = check_device(args.device)
         except ValueError as error:
@@ -117,10 +120,12 @@ class Run:
     def make_env(self, num_envs: int, horizon: int, **options: Any) -> DiffEnv:
         """This rank's share of the training environments, with its own random start states, and options of DiffEnv."""
         self._samples = num_envs * horizon
-        args, size = self.args, num_envs // distributed.size()
+        args, processes = self.args, distributed.size()
+        if num_envs % processes:
+            fail(f"--num-envs {num_envs} cannot be split evenly among {processes} processes")
         seed = args.seed + distributed.rank() * RANK_SEED
         varied_by = find_task(args.env).varied_by
-        self._env = make_env(args, size, horizon, seed, factors=varied_by is not None, **options)
+        self._env = make_env(args, num_envs // processes, horizon, seed, factors=varied_by is not None, **options)
         if varied_by is not None:
             self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
         return self._env
@@ -249,10 +254,8 @@ class Run:
         self.message(f"iteration {self.iteration}: {evaluation}")
 
     def message(self, text: str) -> None:
-        """Print a line above the progress bar, unless --quiet."""
-        if self._log is not None:
-            self._log.message(text)
-        elif self.writes and not self.args.quiet:
+        """Print a line, unless --quiet."""
+        if self.writes and not self.args.quiet:
             say(text)
 
     def _end_iteration(self) -> None:
@@ -306,11 +309,6 @@ class Run:
         existing = path / "checkpoint.pt"
         if existing.exists() and (args.resume is None or not args.resume.samefile(existing)):
             fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
-        if args.track:
-            try:
-                import wandb  # noqa: F401
-            except ImportError:
-                fail("--track needs Weights & Biases: pip install wandb")
 
     def _open(self) -> None:
         """Begin to write and to receive signals, once."""
@@ -326,11 +324,6 @@ class Run:
         arguments = dataclasses.asdict(args)
         with self._writing():
             (directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
-            if args.track:
-                import wandb
-
-                options = dict(name=directory.name, dir=directory, config=arguments, sync_tensorboard=True)
-                wandb.init(project="diffsim", **options)
             start = directory, self.iteration, self.control_steps
             self._log = ProgressLog(*start, arguments, args.iterations, args.quiet)
 

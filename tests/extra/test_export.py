@@ -15,11 +15,12 @@ import diffsim
 import shac
 from diffsim import tasks
 from diffsim.extra import commands as command
+from diffsim.extra.learning.likeliest import Likeliest
 from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.tracking import G1Track
 from diffsim.extra.robots.joystick import Go1
 from diffsim.tasks.base import ASSETS
-from diffsim.training import Likeliest, ObsNormalizer, load_policy, parse
+from diffsim.training import ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
 
 STATE: dict[str, Any] = {"args": {"env": "cartpole"}, "iteration": 1}
