@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import math
 import os
+import socket
 import sys
 import tempfile
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -42,6 +44,26 @@ def make_unused(wanted: Path) -> Path:
         except FileExistsError:
             wanted = wanted.with_name(f"{wanted.name.partition('.')[0]}.{number}")
     raise AssertionError
+
+
+def lock(directory: Path) -> TextIO:
+    """Keep other processes from running in a directory until the returned file is closed or this process has ended.
+
+    The operating system holds the lock, so a killed process leaves none. A second process ends here with one line.
+    """
+    file = (directory / "lock").open("a+")
+    try:
+        import fcntl  # Windows has none
+
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (ImportError, OSError) as error:
+        if getattr(error, "errno", None) in (errno.EACCES, errno.EAGAIN):  # others: the file system has no locks
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            fail(f"{directory} is in use by {holder}: wait for its end, or choose another --run-dir")
+    file.truncate(0)
+    print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
+    return file
 
 
 class EpisodeStatistics:
