@@ -47,20 +47,20 @@ def make_unused(wanted: Path) -> Path:
 
 
 def lock(directory: Path) -> TextIO:
-    """Keep other processes from running in a directory until the returned file is closed or this process has ended.
+    """End the script if another process runs in a directory; else keep others out until the file is closed.
 
-    The operating system holds the lock, so a killed process leaves none. A second process ends here with one line.
+    The operating system holds the lock, so a killed process leaves none.
     """
     file = (directory / "lock").open("a+")
-    try:
-        import fcntl  # Windows has none
+    with suppress(ImportError):  # of Windows
+        import fcntl
 
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (ImportError, OSError) as error:
-        if getattr(error, "errno", None) in (errno.EACCES, errno.EAGAIN):  # others: the file system has no locks
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            fail(f"{directory} is in use by {holder}: wait for its end, or choose another --run-dir")
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):  # others: the file system has no locks
+                file.seek(0)
+                fail(f"{directory} is in use by {file.read().strip()}: wait for its end, or choose another --run-dir")
     file.truncate(0)
     print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
     return file

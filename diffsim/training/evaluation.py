@@ -212,6 +212,7 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
     args = SimpleNamespace(**vars(Flags()) | saved.args | {"device": "cpu", "threads": 0} | changes)
     env = make_env(args, num_envs, forces=forces)
     fitting(saved.network, env)
+    pkgutil.resolve_name(checkpoint.PROVENANCE).compare(saved.robot, env.scene)
     return env
 
 
@@ -235,6 +236,7 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
         return restored.evaluate()
 
     evaluation = measure(args)
+    pkgutil.resolve_name(checkpoint.PROVENANCE).compare(state.get("robot"), evaluation.scene)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     write_evaluation(args, evaluation, state["iteration"], **compare_finer(args, evaluation, measure))
 

@@ -162,6 +162,10 @@ class Run:
             if state["args"]["env"] != self.args.env and not FILE.fullmatch(self.args.env):
                 episodes = None  # which stand on another clip's frames or on other ground: new ones begin
             checkpoint.restore(learner, state, episodes)
+            if self.writes:
+                pkgutil.resolve_name(checkpoint.PROVENANCE).compare(
+                    state.get("robot"), (self._env or self.eval_env).scene
+                )
             self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]
@@ -308,8 +312,7 @@ class Run:
         check_writable(path)
         self._check_unused(path)
         if args.resume and path.is_dir():
-            with self._writing():
-                self._lock = lock(path)  # before its checkpoint is read
+            self._lock = lock(path)  # before its checkpoint is read
         if args.track:
             try:
                 import wandb  # noqa: F401
@@ -395,6 +398,7 @@ class Run:
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
         state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
         state |= dict(simulator=self.simulator, task=find_task(self.args.env).stored())
+        state |= dict(robot=pkgutil.resolve_name(checkpoint.PROVENANCE).fingerprint((self._env or self.eval_env).scene))
         with self._writing():
             checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
         self._saved = self.iteration
