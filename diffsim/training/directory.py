@@ -30,7 +30,8 @@ def check_writable(directory: Path) -> None:
     try:
         str(directory).encode()  # tensorboard writes it
         existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
-        tempfile.TemporaryFile(dir=existing).close()
+        with tempfile.TemporaryFile(dir=existing) as file:
+            file.write(bytes(1000))  # a full disk has room for an empty file
     except (OSError, UnicodeError) as error:
         fail(f"cannot write to run directory {directory}: {getattr(error, 'strerror', 'its name is not UTF-8')}")
 
@@ -51,7 +52,10 @@ def lock(directory: Path) -> TextIO:
 
     The operating system holds the lock, so a killed process leaves none.
     """
-    file = (directory / "lock").open("a+")
+    try:
+        file = (directory / "lock").open("a+")
+    except OSError as error:
+        fail(f"cannot write to run directory {directory}: {error.strerror}")
     with suppress(ImportError):  # of Windows
         import fcntl
 

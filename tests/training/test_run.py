@@ -205,9 +205,16 @@ def test_another_default_dtype_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no limit")
-@pytest.mark.parametrize(("limit", "arguments"), [(30_000, "--save-every 1"), (1_000, "--save-every 0")])
-def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, tmp_path, capsys):
-    """What does not fit is the checkpoint, or the progress."""
+@pytest.mark.parametrize(
+    ("limit", "arguments", "message"),
+    [
+        (30_000, "--save-every 1", "to {}: File too large; {}/checkpoint.pt is of iteration 2"),
+        (1_000, "--save-every 0", "to {}: File too large; {}/checkpoint.pt is of iteration 2"),
+        (10, "--save-every 0", "to run directory {}: File too large"),
+    ],
+)
+def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, message, tmp_path, capsys):
+    """What does not fit is the checkpoint, or the progress, or anything at all."""
     import resource
 
     run(bptt, tmp_path, *TINY, "--iterations", 50, "--quiet", stop_after=2)
@@ -222,7 +229,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, tmp_path, caps
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
     error = refusal(resume, capsys)
-    assert error == f"script.py: cannot write to {tmp_path}: File too large; {path} is of iteration 2"
+    assert error == f"script.py: cannot write {message.format(tmp_path, tmp_path)}"
     assert path.read_bytes() == whole and not list(tmp_path.glob("*.tmp"))
 
 
@@ -286,6 +293,12 @@ def test_a_directory_is_free_when_its_run_has_ended(end, tmp_path, monkeypatch, 
         bptt.main(["--resume", str(tmp_path)])
     assert all(held) and len(held) == (0 if end == "start" else 1)
     assert is_free(tmp_path)
+
+
+def test_a_lock_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    (tmp_path / "lock").mkdir()
+    error = refusal(lambda: bptt.main([*TINY, "--iterations", "2", "--run-dir", str(tmp_path)]), capsys)
+    assert error == f"script.py: cannot write to run directory {tmp_path}: Is a directory"
 
 
 # What it counts -------------------------------------------------------------------------------------------------------
