@@ -18,6 +18,7 @@ from torch import Tensor
 
 from diffsim import DiffEnv, Scene, Simulator, load_scene
 from diffsim.extra.render import slabs
+from diffsim.robot.elements import numeric
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Task
 from diffsim.training import fail
@@ -51,12 +52,15 @@ def mujoco_model(scene: Scene, control_dt: float, substeps: int | None = None) -
     """A scene's file as MuJoCo reads it, with the fewest steps of equal length that are no longer than the file's. Of a
     scene that is no file's, as a task may make one, its model.
 
-    Given substeps of a control step, with those and elliptic cones: the law of --contact mujoco.
+    Given substeps of a control step, with those and elliptic cones: the law of --contact mujoco. Without, the paper's
+    tasks have pyramidal cones.
     """
     file = Path(scene.path).is_file()
     model = mujoco.MjModel.from_xml_path(scene.path) if file else copy.copy(scene.mj_model)
     if substeps is not None:
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    elif len(numeric(model, "k_n")):  # the paper's tasks, in MuJoCo's default cone
+        model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     model.opt.timestep = control_dt / (substeps or math.ceil(control_dt / model.opt.timestep - 1e-6))
     return model
 

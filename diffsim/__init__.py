@@ -20,6 +20,7 @@ from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, Task, TaskError, find_task
 
+__version__ = "1.0.0"
 __all__ = [
     "TASKS",
     "DiffEnv",

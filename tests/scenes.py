@@ -38,6 +38,7 @@ DISTINCT_CASES = [
 # A free sphere of 2 kg; it falls, rolls, slides and rests.
 BALL = """
 <mujoco>
+  <option cone="elliptic"/>
   <custom>
     <numeric name="k_n" data="2e4"/> <numeric name="k_d" data="2e4"/> <numeric name="k_t" data="50"/>
     <numeric name="mu" data="0.5"/>
@@ -47,6 +48,9 @@ BALL = """
     <body pos="0 0 1"> <freejoint/> <geom type="sphere" size="0.1" mass="2"/> </body>
   </worldbody>
 </mujoco>"""
+
+# A capsule with pyramidal cones, which turn with it.
+BAR = BALL.replace('"sphere" size="0.1"', '"capsule" size="0.1 0.1"').replace("elliptic", "pyramidal")
 
 # One driven hinge on the world. Its laws are in the kernels even where they do nothing, so all such robots share them.
 ONE_HINGE = """

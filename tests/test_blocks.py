@@ -12,6 +12,7 @@ import pytest
 import torch
 from scenes import (
     BALL,
+    BAR,
     PENDULUM,
     acting_states,
     free_states,
@@ -42,8 +43,8 @@ def case(name: str, rng: np.random.Generator):
     if name == "fish":
         scene = small_scene("fluid")
         return scene, free_states(scene, COUNT, rng)
-    if name == "ball on hills":
-        scene = parse(BALL).with_terrain(HILLS)
+    if name in ("ball on hills", "bar on hills"):
+        scene = parse(BAR if name == "bar on hills" else BALL).with_terrain(HILLS)
         return scene, pressed(scene, everywhere(rng)[:COUNT], rng)
     if name == "hopper on hills":  # elsewhere for each
         return hopping(HILLS + np.linspace(-0.6, 0.6, COUNT)[:, None, None] * [1, 0], COUNT, rng)
@@ -79,6 +80,7 @@ def step(scene, states, dtype, integration, weights=None, **options):
         pytest.param("hopper on hills", SEMI, {}, marks=pytest.mark.slow),
         pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),
         ("ball on hills", MUJOCO, {}),
+        ("bar on hills", MUJOCO, {"factors": True}),
     ],
 )
 def test_laws_are_those_of_float64(name, integration, options, rng):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import BALL, SHOULDER, acting_states, free_states, parse, task_scene
+from scenes import BALL, acting_states, free_states, parse, task_scene
 
 import diffsim
 from diffsim.sim.integration import Integration
@@ -56,13 +56,16 @@ def test_simulator_contains_what_is_not_finite(name, integration, where, value, 
     assert not sim.nonfinite.any()
 
 
-@pytest.mark.parametrize("scene", [BALL, SHOULDER])
+BALLS = BALL.replace('mass="2"/>', 'mass="2"/> <body> <joint type="ball" stiffness="1"/> <geom size="0.1"/> </body>')
+
+
+@pytest.mark.parametrize("joint", [0, 1], ids=["free", "ball"])
 @pytest.mark.parametrize("length", [0.0, 1e-20, 1e20])
-def test_quaternions_without_a_direction_are_contained(scene, length, rng):
+def test_quaternions_without_a_direction_are_contained(joint, length, rng):
     """Lengths from 1e-10 to 1e10 are normalised. A zero one's gradient was NaN, far ones became the identity."""
-    scene = parse(scene)
+    scene = parse(BALLS)
     states, sim = [x.astype(np.float32) for x in free_states(scene, 5, rng)], Simulator(scene, 5)
-    quaternions = states[0][:, scene.quaternion_adr[0] :][:, :4]
+    quaternions = states[0][:, scene.quaternion_adr[joint] :][:, :4]
     quaternions[[0, 1]] *= np.array([[1e-10], [1e10]], np.float32)
     outputs, gradients = step_and_gradients(sim, states)
     assert not sim.nonfinite.any()
@@ -206,10 +209,7 @@ def test_environment_that_blows_up_is_reset_and_counted(name):
         *((f"implicit is {x!r}, must be True or False", dict(implicit=x)) for x in (1, "yes")),
         ("implicit is True, but only soft contact has", dict(contact="mujoco", implicit=True)),
         *((f"tolerance is {x!r}, must lie between 0 and 1", dict(tolerance=x)) for x in (0, 1.0, np.nan, "a", True)),
-        *(
-            (f"terrain is {x}, must be from 0 to 45 degrees", dict(name="hopper", terrain=x))
-            for x in (45.5, -1, np.nan)
-        ),
+        (r"terrain has shape \(\), must be \(K, 2\)", dict(name="hopper", terrain=20.0)),
         ("penalty constant mu is 'a'", dict(name="hopper", penalty={"mu": "a"})),
         (r"penalty constant k_n is 1e\+39", dict(name="hopper", penalty={"k_n": 1e39})),  # infinite in the kernels
         *(("control_dt is", dict(control_dt=x)) for x in (0.0, -1.0, np.nan, np.inf, "a")),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -20,6 +22,7 @@ from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
 from diffsim.robot.constraint import constrained
+from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
@@ -59,9 +62,18 @@ def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
             assert function in source, function
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(wp.float32, marks=pytest.mark.slow), wp.float64])
-def test_kernels_with_constraints_compile_for_a_gpu_without_one(dtype: type) -> None:
-    scene = constrained(task_scene("ant"), 1 / 240)
+@pytest.mark.parametrize(
+    "dtype, cone",
+    [
+        (wp.float64, mujoco.mjtCone.mjCONE_ELLIPTIC),
+        pytest.param(wp.float32, mujoco.mjtCone.mjCONE_ELLIPTIC, marks=pytest.mark.slow),
+        pytest.param(wp.float32, mujoco.mjtCone.mjCONE_PYRAMIDAL, marks=pytest.mark.slow),
+    ],
+)
+def test_kernels_with_constraints_compile_for_a_gpu_without_one(dtype: type, cone: mujoco.mjtCone) -> None:
+    model = copy.copy(task_scene("ant").mj_model)
+    model.opt.cone = cone
+    scene = constrained(load_scene(model), 1 / 240)
     spec = kernel_spec(scene, divide(scene, 4), dtype, implicit=False, env_last=True, varied=True, constrained=True)
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
         compiled(kernel.module, arch=90)

@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _later(function: Callable[..., object]) -> Callable[..., Callable[[], object]]:
-    """Of the same signature: the call, to be made."""
+    """Return a function of the same signature that returns the call, to be made."""
     return functools.wraps(function)(lambda *args, **kwargs: functools.partial(function, *args, **kwargs))
 
 
@@ -217,7 +217,7 @@ def describe_machine() -> dict[str, str]:
 
 
 def find_gpu_troubles() -> list[str]:
-    """What to look at on a machine that has a driver where torch or Warp sees no GPU."""
+    """Say what to look at on a machine that has a driver where torch or Warp sees no GPU."""
     sees = {"torch": torch.cuda.is_available(), "Warp": wp.is_cuda_available()}
     if all(sees.values()) or not (startup.nvidia_driver() or shutil.which("nvidia-smi")):
         return []

@@ -1,4 +1,4 @@
-"""How a robot moves over the ground, as numbers of each foot, and of the robot with its actions."""
+"""Measure how a robot moves over the ground, as numbers of each foot, and of the robot with its actions."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def work(scene: Scene, dt: float, qpos: Array, action: Array) -> float:
 
 
 def measure(scene: Scene, dt: float, episodes: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> Gait:
-    """Of episodes qpos (F, nq) and action (F, nu); empty without contact with a plane or if all are short."""
+    """Measure episodes of qpos (F, nq) and action (F, nu); empty without contact with a plane or if all are short."""
     first, feet = round(SETTLING / dt), Gait()
     settled = [(q[first:], a[first:]) for q, a in islice(episodes, EPISODES) if len(q) > first + 1]
     if "contact" not in scene.features or scene.terrain is not None or not settled:

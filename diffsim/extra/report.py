@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import HULL_POINTS, base_geoms, collide, declared_pairs, ground_pairs, pair_law
-from diffsim.robot.elements import disabled_flags, label, listed, motors
+from diffsim.extra.gait import trace
+from diffsim.robot.contact import (
+    HULL_POINTS,
+    base_geoms,
+    collide,
+    contact_points,
+    declared_pairs,
+    ground_pairs,
+    hull,
+    pair_law,
+)
+from diffsim.robot.elements import control_range, disabled_flags, label, listed, motors
 from diffsim.robot.scene import Scene
 
-Kind = mujoco.mjtObj
+Kind, Geom, Integrator = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtIntegrator
 
 # How a geom's points stand for it, by its type
 ROUGH_SHAPES = {
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "8 of each rim of a cylinder",
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "14 of an ellipsoid's surface",
-    int(mujoco.mjtGeom.mjGEOM_MESH): f"at most {HULL_POINTS} corners of a mesh's convex hull",
+    int(Geom.mjGEOM_CYLINDER): "8 of each rim of a cylinder",
+    int(Geom.mjGEOM_ELLIPSOID): "14 of an ellipsoid's surface",
+    int(Geom.mjGEOM_MESH): f"at most {HULL_POINTS} corners of a mesh's convex hull",
 }
+# Integrators that are not simulated, and which one is in their place
+REPLACED = {
+    int(Integrator.mjINT_RK4): (Integrator.mjINT_EULER, "integrator RK4, simulated as Euler"),
+    int(Integrator.mjINT_IMPLICIT): (Integrator.mjINT_IMPLICITFAST, "integrator implicit, simulated as implicitfast"),
+}
+DIRECTIONS, STARTS = 2000, 12  # in which shapes are measured; of the motions of which steps are compared
+LEAST_ERROR = 0.01  # %, that is told
 
 
 def report(scene: Scene) -> str:
@@ -42,13 +60,14 @@ def _parts(scene: Scene) -> Iterator[str]:
     yield f"state      nq {scene.nq}, nv {scene.nv}"
     yield f"mass       {scene.mass.sum():.4g} kg"
     yield f"controls   {scene.nu - muscles} motors, {muscles} muscles"
+    yield f"timestep   {1e3 * m.opt.timestep:g} ms in the file; in a task control_dt / substeps"
     yield f"contact    {scene.ncontact} points, {ground}"
     yield f"features   {', '.join(sorted(scene.features))}"
 
 
 def approximations(scene: Scene) -> tuple[str, ...]:
     """Return a sentence for each approximation."""
-    return tuple(sentence for check in (_self_contact, _ground, _actuators) for sentence in check(scene))
+    return tuple(sentence for check in (_self_contact, _ground, _actuators, _options) for sentence in check(scene))
 
 
 def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
@@ -84,10 +103,75 @@ def _self_contact(scene: Scene) -> Iterator[str]:
 def _ground(scene: Scene) -> Iterator[str]:
     m, pairs = scene.mj_model, ground_pairs(scene.mj_model)
     kinds = {int(m.geom_type[geom]) for _, geom in pairs}
-    if told := ", ".join(what for kind, what in ROUGH_SHAPES.items() if kind in kinds):
-        yield f"The ground feels these points of a shape: {told}."
-    if any(pair_law(m, *pair).condim > 3 for pair in pairs):
-        yield "Torsional and rolling friction, condim 4 and 6, are left out: contact has condim 3."
+    told = []
+    for kind, what in ROUGH_SHAPES.items():
+        if kind in kinds:
+            inside = max(_depth(m, geom) for _, geom in pairs if m.geom_type[geom] == kind)
+            told.append(f"{what} (the shape reaches up to {1e3 * inside:.2g} mm beyond)")
+    if told:
+        yield f"The ground feels these points of a shape: {', '.join(told)}."
+
+
+def _depth(m: mujoco.MjModel, geom: int) -> float:
+    """Return how far [m] a shape reaches beyond its contact points, in the direction where that is farthest."""
+    turn, z = np.pi * (3 - 5**0.5) * np.arange(DIRECTIONS), 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
+    level = np.sqrt(1 - z**2)
+    x, y, (a, b, c) = level * np.cos(turn), level * np.sin(turn), m.geom_size[geom]
+    directions = np.stack((x, y, z), 1)
+    if m.geom_type[geom] == Geom.mjGEOM_MESH:
+        reach = (directions @ hull(m, m.geom_dataid[geom]).T).max(1)
+    else:
+        cylinder = m.geom_type[geom] == Geom.mjGEOM_CYLINDER
+        reach = a * level + b * abs(z) if cylinder else np.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2)
+    return float((reach - (directions @ contact_points(m, geom)[0].T).max(1)).max())
+
+
+def _options(scene: Scene) -> Iterator[str]:
+    """Name what MuJoCo's steps have and steps on MuJoCo's constraints have not, and measure how much that is."""
+    m, other = scene.mj_model, copy.copy(scene.mj_model)
+    other.opt.integrator, *found = REPLACED.get(m.opt.integrator, [m.opt.integrator])
+    other.opt.noslip_iterations, other.opt.solver = 0, mujoco.mjtSolver.mjSOL_NEWTON
+    other.opt.iterations, other.opt.ls_iterations = max(100, m.opt.iterations), max(50, m.opt.ls_iterations)
+    other.geom_condim[:], other.pair_dim[:] = np.minimum(m.geom_condim, 3), np.minimum(m.pair_dim, 3)
+    other.dof_frictionloss[: 6 * scene.floating] = 0
+    condim = max((pair_law(m, *pair).condim for pair in ground_pairs(m)), default=0)
+    for there, what in (
+        (m.opt.noslip_iterations > 0, "noslip_iterations"),
+        (m.opt.solver != other.opt.solver or m.opt.iterations < 100, "a solver that may stop before it converges"),
+        (condim > 3, "torsional and rolling friction (condim 4 and 6; it is 3 here)"),
+        ((m.dof_frictionloss != other.dof_frictionloss).any(), "frictionloss of a free joint (use <freejoint/>)"),
+    ):
+        found += [what] * bool(there)
+    usual, most = _step_errors(scene, other) if found else (0.0, 0.0)
+    if most > LEAST_ERROR:
+        yield f"Left out: {', '.join(found)}. MuJoCo's steps change by {usual:.3g} % (median), {most:.3g} % at most."
+    if other.opt.integrator == Integrator.mjINT_IMPLICITFAST and "drag" in scene.features:
+        yield "A fluid's drag is that of the velocity before a step; implicitfast takes the one after it."
+
+
+def _step_errors(scene: Scene, other: mujoco.MjModel) -> tuple[float, float]:
+    """Return median and largest difference [%] of a step's change of velocity between the file and another model.
+
+    Motions begin near the file's first keyframe, or its reference pose, on the ground.
+    """
+    m, rng, errors = scene.mj_model, np.random.default_rng(0), []
+    data, there, (low, high) = mujoco.MjData(m), mujoco.MjData(other), control_range(m)
+    for _ in range(STARTS):
+        mujoco.mj_resetData(m, data)
+        data.qpos = m.key_qpos[0] if m.nkey else m.qpos0
+        mujoco.mj_integratePos(m, data.qpos, 0.05 * rng.normal(size=m.nv), 1.0)
+        if scene.ncontact:
+            data.qpos += scene.root.up * (trace(scene, data.qpos[None])[0].max() - 0.002)
+        data.qvel, data.ctrl = 0.3 * rng.normal(size=m.nv), rng.uniform(low, high)
+        for _ in range(8):
+            mujoco.mj_step(m, data, 5)
+            for name in ("qpos", "qvel", "act", "ctrl", "qacc_warmstart"):
+                setattr(there, name, getattr(data, name))
+            before = data.qvel.copy()
+            mujoco.mj_step(m, data)
+            mujoco.mj_step(other, there)
+            errors.append(abs(there.qvel - data.qvel).max() / (1e-9 + abs(data.qvel - before).max()))
+    return 100 * float(np.median(errors)), 100 * max(errors)
 
 
 def _actuators(scene: Scene) -> Iterator[str]:
@@ -95,6 +179,14 @@ def _actuators(scene: Scene) -> Iterator[str]:
     free = [label(m, Kind.mjOBJ_ACTUATOR, a) for a in np.flatnonzero(m.actuator_ctrllimited == 0).tolist()]
     if free:
         yield f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {listed(free)}."
+    if m.nkey and m.nu:
+        zero = np.mean(control_range(m), axis=0)
+        if len(moved := np.flatnonzero(abs(m.key_ctrl[0] - zero) > 1e-6)):
+            a = int(moved[0])
+            yield (
+                f"Action 0 is the middle of a ctrlrange, not the ctrl of the file's keyframe: {zero[a]:g}, not "
+                f"{m.key_ctrl[0, a]:g}, of actuator {label(m, Kind.mjOBJ_ACTUATOR, a)}, and of {len(moved) - 1} more."
+            )
     if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         yield "A control sets the activation of a <muscle> at once."
         yield "A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves."

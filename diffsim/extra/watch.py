@@ -8,6 +8,7 @@ from typing import Any
 
 from diffsim.env import DiffEnv
 from diffsim.extra import render
+from diffsim.extra.provenance import compare
 from diffsim.training import Evaluation, SavedPolicy
 from diffsim.training.evaluation import fitting, make_env
 from diffsim.training.flags import Flags
@@ -24,6 +25,7 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
     args = SimpleNamespace(**vars(Flags()) | saved.args | {"device": "cpu", "threads": 0} | changes)
     env = make_env(args, num_envs, forces=forces)
     fitting(saved.network, env)
+    compare(saved.robot, env.scene)
     return env
 
 

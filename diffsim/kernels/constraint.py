@@ -1,4 +1,4 @@
-"""MuJoCo's regularised constraints: contact in the elliptic cone, joint limits and dry friction, and their adjoints.
+"""MuJoCo's regularised constraints: contact, joint limits and dry friction, and their adjoints.
 
 A row of MuJoCo's constraints has a force that depends on the acceleration a of the robot by
 
@@ -7,7 +7,7 @@ A row of MuJoCo's constraints has a force that depends on the acceleration a of 
 with v the row's velocity, r < 0 its violation of the margin, d(r) its impedance (`solimp`), k and b from `solref`, and
 w its inverse weight. J a - jar is MuJoCo's aref. MuJoCo leaves dJ/dt v out of J a. So J a is the velocity of the twists
 B that the links would have if the joints' velocities were their accelerations. A limit has the force -D jar where
-jar < 0, dry friction -D jar bounded by +-eta, a contact the three numbers of `cone_force`. All are linear in a within
+jar < 0, dry friction -D jar bounded by +-eta, a contact the three numbers of cone.py. All are linear in a within
 their zones, with slope -H. So a Newton step of MuJoCo's convex problem,
 
     (M + J'HJ) (a_new - a) = tau + J'f(a) - M a,
@@ -25,6 +25,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lane import K_D, K_N, MU
 from diffsim.kernels.model import functions, types
@@ -40,7 +41,9 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     T, U, vec2, vec3, vec4, vec6, mat3 = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3
     Params, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
     Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
-    CarrierPos, Frame, ground, TERRAIN = t.CarrierPos, t.Frame, terrain_contact(spec), "terrain" in spec.features
+    CarrierPos, Frame, ground, FRAMED = t.CarrierPos, t.Frame, terrain_contact(spec), spec.framed
+    TERRAIN, PYRAMID, BOX = spec.has("terrain pyramid box")
+    cone = pyramidal_cone(spec) if PYRAMID else elliptic_cone(spec)
     in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
@@ -67,46 +70,6 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(d / (rest * T(c[4])), slope / (d * rest), k * d * r, k * (d + slope * r))
 
     @wp.func
-    def cone_force(D: T, friction: T, inv_impratio: T, jar: vec3, sticking: T):
-        """Return a contact's force, and H, minus its derivatives in jar.
-
-        Where sticking is 1, the zone is MuJoCo's quadratic one, whatever jar is.
-        """
-        normal = jar[2]
-        slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
-        quadratic = wp.max(sticking, pick(slip, -friction * inv_impratio * normal, T(1.0), T(0.0)))
-        conical = wp.max(pick(normal, friction * slip, T(1.0), T(0.0)) - quadratic, T(0.0))
-        Dn = quadratic * D
-        Dt = Dn / inv_impratio
-        Ds = conical * D / (T(1.0) + friction * friction * inv_impratio)
-        over = normal - friction * slip
-        inv_slip = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
-        tx = inv_slip * jar[0]
-        ty = inv_slip * jar[1]
-        across = Dt - Ds * over * friction * inv_slip
-        along = Ds * friction * friction - (across - Dt)
-        nx = -Ds * friction * tx
-        ny = -Ds * friction * ty
-        xy = along * tx * ty
-        f = vec3(-across * jar[0], -across * jar[1], -Dn * normal - Ds * over)
-        H = mat3(across + along * tx * tx, xy, nx, xy, across + along * ty * ty, ny, nx, ny, Dn + Ds)
-        return f, H
-
-    @wp.func
-    def friction_derivative(D: T, friction: T, inv_impratio: T, jar: vec3, w: vec3):
-        """Return w . df / d friction, which is 0 outside the cone's zone."""
-        slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
-        quadratic = pick(slip, -friction * inv_impratio * jar[2], T(1.0), T(0.0))
-        conical = pick(jar[2], friction * slip, T(1.0), T(0.0)) - quadratic
-        inv_slip = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
-        mu2 = T(1.0) + friction * friction * inv_impratio
-        Ds = conical * D / mu2
-        over = jar[2] - friction * slip
-        change = Ds * (T(2.0) * friction * inv_impratio / mu2 * over + slip)  # of the normal force
-        along = inv_slip * (jar[0] * w[0] + jar[1] * w[1])
-        return change * w[2] + (Ds * over - friction * change) * along
-
-    @wp.func
     def locate_contact(m: Model, here: Lane, c: int, link: Link, carrier: CarrierPos):
         """Locate contact sphere c over the ground.
 
@@ -117,7 +80,12 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         reach = T(m.contact_radius[c] + m.contact_params[c][10])
         distance, E, curvature = ground.distance(m, here, c, centre, carrier, reach)
-        return centre, distance, pick(distance, T(m.contact_params[c][10]), T(1.0), T(0.0)), E, curvature
+        active = pick(distance, T(m.contact_params[c][10]), T(1.0), T(0.0))
+        if wp.static(BOX):  # of a box MuJoCo takes the corners of the lower half
+            if m.contact_radius[c] == U(0.0):
+                height = in_frame(E, link.R * vec3(m.contact_axis[c]))[2]
+                active = active * pick(T(0.0), height, T(0.0), T(1.0))
+        return centre, distance, active, E, curvature
 
     @wp.func
     def contact_constants(m: Model, here: Lane, c: int):
@@ -152,6 +120,8 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
                 s = c - first
                 centre, distance, active, E, _ = locate_contact(m, here, c, links[i], carrier)
+                if wp.static(PYRAMID):
+                    E = E * cone.frame(cone.heading(m, c, links[i].R, E))
                 sticking = T(1.0) - active * contacts[s].active
                 contacts[s].active = active
                 if block.any_of(active):
@@ -159,13 +129,13 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     last_jar = vec3()
                     for r in range(3):
                         last_jar[r] = pick(T(0.0), sticking, jar[r], contacts[s].jar[r])
-                    f, H = cone_force(state[0], coef[2], T(m.contact_params[c][3]), last_jar, sticking)
+                    f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), last_jar, sticking)
                     contacts[s].p = p
                     contacts[s].jar = jar
                     contacts[s].D = state[0]
                     contacts[s].f = f + H * (last_jar - jar)
                     contacts[s].H = H
-                    if wp.static(TERRAIN):
+                    if wp.static(FRAMED):
                         contacts[s].E = E
 
     @wp.func
@@ -177,7 +147,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 p = contacts[s].p
                 H = contacts[s].H
                 f = contacts[s].f
-                if wp.static(TERRAIN):
+                if wp.static(FRAMED):
                     f = contacts[s].E * f
                     H = contacts[s].E * H * wp.transpose(contacts[s].E)
                 PH = wp.skew(p) * H
@@ -216,13 +186,13 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             s = c - m.contact_begin[here.at]
             if block.any_of(contacts[s].active):
                 step_jar = point_velocity(step, contacts[s].p)
-                if wp.static(TERRAIN):
+                if wp.static(FRAMED):
                     step_jar = in_frame(contacts[s].E, step_jar)
                 if evaluation == 0:
                     contacts[s].Hs = contacts[s].H * step_jar
                 jar = contacts[s].jar + alpha * step_jar
                 friction = contact_constants(m, here, c)[2]
-                f, H = cone_force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
+                f, H = cone.force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
                 force_error = contacts[s].f - alpha * contacts[s].Hs - f
                 w = T(m.contact_params[c][4])
                 accel_error = acceleration_for(force_error, w, H)
@@ -277,25 +247,34 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     ):
         """Add the contacts' part of phi to link k's adjoints."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, active, E, curvature = locate_contact(m, here, c, link, carrier)
+            centre, distance, active, feature, curvature = locate_contact(m, here, c, link, carrier)
             if block.any_of(active):
+                E = feature
+                if wp.static(PYRAMID):
+                    heading = cone.heading(m, c, link.R, feature)
+                    E = feature * cone.frame(heading)
                 p, _, state, coef = contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
                 jar = vec3()
                 for r in range(3):
                     jar[r] = kin.load(ck.a, here.row, 2 * NV + 3 * c + r, here.e)
-                f, H = cone_force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
+                f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
                 w = in_frame(E, point_velocity(node.W, p))
                 velocity = in_frame(E, point_velocity(link.V, p))
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
                 if wp.static(VARIED):
                     by_k = T(0.5) * coef[1] * wp.dot(g_jar, velocity) + g_jar[2] * state[2]
-                    by_mu = friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
+                    by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
                     adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
                     adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
-                if wp.static(TERRAIN):  # adjoint of the frame's angle
-                    g_angle = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2]))[1] - wp.cross(f, w)[1]
+                if wp.static(FRAMED):  # adjoint of a rotation of the frame
+                    g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
+                if wp.static(PYRAMID):
+                    g_turn = cone.frame(heading) * g_turn
+                    g_heading = g_turn[2] * cone.heading_derivative(heading)
+                    adj.p = adj.p + sp.join(in_world(feature, g_heading), vec3())
+                    g_turn = g_turn - g_heading
                 f = in_world(E, f)
                 g_jar = in_world(E, g_jar)
                 G = force_at(p, g_jar)
@@ -306,12 +285,12 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 adj.v = adj.v + coef[1] * G
                 adj.b = adj.b + G
                 # The point follows the sphere's centre, at half its speed along the normal, which turns with it.
-                g_p = in_frame(E, g_p)
+                g_p = in_frame(feature, g_p)
                 g_p[2] = T(0.5) * g_p[2] + g_r
                 if wp.static(TERRAIN):
                     arm = T(m.contact_radius[c]) + T(0.5) * distance
-                    g_p[0] = g_p[0] + curvature * (g_angle - arm * g_p[0])
-                adj.p = adj.p + force_at(centre, in_world(E, g_p))
+                    g_p[0] = g_p[0] + curvature * (g_turn[1] - arm * g_p[0])
+                adj.p = adj.p + force_at(centre, in_world(feature, g_p))
                 adj.p = (
                     adj.p + wp.spatial_cross_dual(coef[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
                 )

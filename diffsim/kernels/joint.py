@@ -31,7 +31,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     pick = block.pick
     STIFFNESS, DAMPING, LIMIT, CLAMP = spec.has("stiffness damping limit clamp")
     LIMIT = LIMIT and not spec.constrained
-    VARIED, NU = spec.varied, spec.nu
+    VARIED, NU, EXPLICIT_SERVOS = spec.varied, spec.nu, "explicit_servos" in spec.features
 
     def motors(rows: type) -> wp.Function:
         @wp.func
@@ -73,6 +73,13 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(CLAMP):
             result = result + unclamped * T(m.servo_damping[i])
         return result
+
+    @wp.func
+    def end_damping(m: Model, i: int, unclamped: T):
+        """Return the part of it that acts on the velocity at the end of MuJoCo's step."""
+        if wp.static(EXPLICIT_SERVOS):
+            return T(m.damping[i])
+        return damping(m, i, unclamped)
 
     @wp.func
     def limit_violation(m: Model, i: int, q: T):

@@ -176,6 +176,7 @@ FIELDS: dict[str, Field] = {
     "contact_radius": ("reals", lambda n: n.scene.contact_radius[n.spheres[1]]),  # m
     # MuJoCo's constraints: rows of robot.scene.Constraints
     "contact_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.contact[n.spheres[1]]),
+    "contact_axis": ("vec3s", lambda n: n.scene.constraints and n.scene.constraints.axis[n.spheres[1]]),
     "limit_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.limit[n.link]),
     "joint_loss": ("vec3s", lambda n: n.scene.constraints and n.scene.constraints.loss[n.link]),
     # Bodies of the MJCF, for external forces
@@ -385,7 +386,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
             "d": vec6,  # D
             "w1": vec6,  # W1
         }
-    if "terrain" in spec.features:
+    if spec.framed:
         structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
     kinds |= {name: struct(name, members) for name, members in structs.items()}
     return SimpleNamespace(
@@ -395,7 +396,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         scene=scene_types(U),
         Model=scene_types(U).Model,
         CarrierPos=vec2 if "terrain" in spec.features else T,  # the carrier's (x, z), or its height
-        Frame=mat3 if "terrain" in spec.features else T,  # of a contact: E of terrain.py, or the world's, of which is 1
+        Frame=mat3 if spec.framed else T,  # of a contact: E of terrain.py, or the world's, of which is 1
     )
 
 

@@ -126,7 +126,7 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
             d = d + here.h * resistance[1]
         if wp.static(CONSTRAINED):
             if phase == SOLVE:
-                damper = here.h * joint.damping(m, k, unclamped)
+                damper = here.h * joint.end_damping(m, k, unclamped)
                 d = d + damper
                 f = -damper * motion.accel_joint
             else:
@@ -289,7 +289,9 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
                     unclamped = T(1.0)
                     if wp.static(CLAMP):
                         unclamped = nodes[i].unclamped
-                    nodes[i].g = nodes[i].gqd + damping_pass * joint.damping(m, here.at + i, unclamped) * nodes[i].lam
+                    nodes[i].g = (
+                        nodes[i].gqd + damping_pass * joint.end_damping(m, here.at + i, unclamped) * nodes[i].lam
+                    )
             solve(m, here, ck, SOLVES * here.row + s, links, nodes, g_base)
             damping_pass = T(1.0)
 

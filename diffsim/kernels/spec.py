@@ -44,6 +44,11 @@ class KernelSpec:
         return "floating" in self.features
 
     @property
+    def framed(self) -> bool:
+        """Tell whether contacts have frames of their own: on a terrain, and in pyramidal cones."""
+        return bool(self.features & {"terrain", "pyramid"})
+
+    @property
     def dof0(self) -> int:
         """Return the base's number of degrees of freedom: joint i is dof0 + i - 1 in qvel."""
         return 6 if self.floating else 0
@@ -64,7 +69,8 @@ class KernelSpec:
     @property
     def damped(self) -> bool:
         """Tell whether damping follows the constraints."""
-        return self.constrained and bool(self.features & {"damping", "base_damping"})
+        damping, base_damping, explicit = self.has("damping base_damping explicit_damping")
+        return self.constrained and (damping or base_damping) and not explicit
 
     @property
     def nfactor(self) -> int:

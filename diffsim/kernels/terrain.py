@@ -29,6 +29,7 @@ from diffsim.kernels.wide import blocks
 @cache
 def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
     t, block, BLOCK, TERRAIN = types(spec), blocks(spec), spec.block, "terrain" in spec.features
+    FRAMED = spec.framed
     T, U, vec3, vec4, mat3, Model, uvec4 = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.scene.vec4
 
     @wp.func
@@ -147,19 +148,21 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(TERRAIN):
             hit = nearest_of_each(m, here.e, carrier[0] + centre[0], carrier[1] + centre[2], m.contact_radius[c], reach)
             return hit[0], frame_of(hit), hit[3]
+        elif wp.static(FRAMED):
+            return carrier + centre[2] - T(m.contact_radius[c]), wp.identity(3, dtype=T), T(0.0)
         else:
             return carrier + centre[2] - T(m.contact_radius[c]), T(1.0), T(0.0)
 
     @wp.func
     def in_frame(E: t.Frame, v: vec3):
         """Transform a world vector to a contact's frame, in which the law acts."""
-        if wp.static(TERRAIN):
+        if wp.static(FRAMED):
             return wp.transpose(E) * v
         return v
 
     @wp.func
     def in_world(E: t.Frame, v: vec3):
-        if wp.static(TERRAIN):
+        if wp.static(FRAMED):
             return E * v
         return v
 

@@ -14,10 +14,12 @@ from numpy.typing import ArrayLike
 
 from diffsim.robot.contact import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
-from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, SceneError
+from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, SceneError, takes_euler
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
+MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precision still holds
+LEAST_SOFTNESS = 1e-6  # of a pyramid's edges, at which Newton's method fails in single precision
 
 
 def constrained(scene: Scene, seconds: float) -> Scene:
@@ -27,22 +29,31 @@ def constrained(scene: Scene, seconds: float) -> Scene:
         raise SceneError(f"{scene.name}: on MuJoCo's contact {'; '.join(found)}")
     fastest = 0.0 if "refsafe" in disabled_flags(m) else 2 * seconds
     ground = ground_pairs(m)[0][0] if len(scene.spheres.geom) else 0
-    contact = [_contact(m, ground, geom, fastest) for geom in scene.spheres.geom.tolist()]
+    contact = [_contact(scene, ground, geom, fastest) for geom in scene.spheres.geom.tolist()]
     first = m.nv - scene.nlink + 1
     limit, loss = np.tile(_numbers((1.0, 1.0), (0.9, 0.9, 1.0, 0.5, 2.0), 1.0, 0.0), (scene.nlink, 1)), []
     for link, dof in enumerate(range(first, m.nv), start=1):
         joint, weight = m.dof_jntid[dof], m.dof_invweight0[dof]
         limit[link, 4] = weight
         if np.isfinite(scene.lower[link]):
-            limit[link] = _numbers(m.jnt_solref[joint], m.jnt_solimp[joint], weight, m.jnt_margin[joint], fastest)
+            numbers = _numbers(m.jnt_solref[joint], m.jnt_solimp[joint], weight, m.jnt_margin[joint], fastest)
+            limit[link] = _in_range(numbers, f"{scene.name}: joint {label(m, mujoco.mjtObj.mjOBJ_JOINT, joint)}")
         k, b, _, _, _, d, *_ = _numbers(m.dof_solref[dof], m.dof_solimp[dof], weight, 0.0, fastest)
         loss.append((m.dof_frictionloss[dof], d / ((1 - d) * weight), b))
+    damping, servo_damping = scene.damping, scene.servo_damping
+    if takes_euler(m):  # which takes a servo's damping explicitly, and so apart from the joint's own
+        damping = np.minimum(damping, np.append(0.0, m.dof_damping[first:]))
+        servo_damping = servo_damping + scene.damping - damping
     return dataclasses.replace(
         scene,
+        damping=damping,
+        servo_damping=servo_damping,
         contact_link=scene.spheres.link,
         contact_position=scene.spheres.centre,
         contact_radius=scene.spheres.radius,
-        constraints=Constraints(np.array(contact).reshape(-1, 11), limit, np.array([(0.0, 1.0, 0.0), *loss])),
+        constraints=Constraints(
+            np.array(contact).reshape(-1, 11), scene.spheres.axis, limit, np.array([(0.0, 1.0, 0.0), *loss])
+        ),
     )
 
 
@@ -61,12 +72,24 @@ def check_soft(scene: Scene) -> None:
         )
 
 
-def _contact(m: mujoco.MjModel, ground: int, geom: int, fastest: float) -> Array:
+def _contact(scene: Scene, ground: int, geom: int, fastest: float) -> Array:
+    m = scene.mj_model
     law = pair_law(m, ground, geom)
     weight = m.body_invweight0[m.geom_bodyid[[ground, geom]], 0].sum()
     friction = max(law.friction, LEAST_FRICTION) if law.condim > 1 else 0.0
     numbers = _numbers(law.solref, law.solimp, weight, law.margin, fastest)
     numbers[2:4] = friction, 1 / m.opt.impratio
+    name, end = f"{scene.name}: geom {label(m, mujoco.mjtObj.mjOBJ_GEOM, geom)}", numbers[5:7].max()
+    edges = 2 * friction**2 * (1 + friction**2) / m.opt.impratio * (1 - end) / end
+    if m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and 0 < edges < LEAST_SOFTNESS:
+        raise SceneError(f"{name}: a pyramid of so little friction or large impratio is too stiff; take condim 1")
+    return _in_range(numbers, name)
+
+
+def _in_range(numbers: Array, what: str) -> Array:
+    """Return a row of constants; raises SceneError if single precision does not hold their squares."""
+    if not np.abs(numbers).max() < MOST_NUMBER:
+        raise SceneError(f"{what}: its solref, solimp, friction or impratio is out of range")
     return numbers
 
 

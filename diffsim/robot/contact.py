@@ -109,14 +109,14 @@ def contact_points(m: mujoco.MjModel, geom: int) -> tuple[Array, float]:
     """Return the centres (n, 3), in the geom's frame, of the spheres that stand for it, and their radius."""
     kind, size = mujoco.mjtGeom(m.geom_type[geom]), m.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return _spread(_hull(m, m.geom_dataid[geom])), 0.0
+        return _spread(hull(m, m.geom_dataid[geom])), 0.0
     points = POINTS[int(kind)]
     if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
         return points * size[1], float(size[0])
     return points * (size[[0, 0, 1]] if kind == mujoco.mjtGeom.mjGEOM_CYLINDER else size), 0.0
 
 
-def _hull(m: mujoco.MjModel, mesh: int) -> Array:
+def hull(m: mujoco.MjModel, mesh: int) -> Array:
     """Return the vertices (n, 3) of a mesh's convex hull, or all of its vertices if MuJoCo has made no hull."""
     vertices: Array = m.mesh_vert[m.mesh_vertadr[mesh] :][: m.mesh_vertnum[mesh]].astype(float)
     if m.mesh_graphadr[mesh] < 0:

@@ -16,6 +16,8 @@ from diffsim.robot.elements import at_rest, control_range, disabled_flags, float
 from diffsim.robot.refuse import beyond, obstacles
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
 
+Geom = mujoco.mjtGeom
+
 
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
     """Read an MJCF file or copy a model.
@@ -304,17 +306,20 @@ class _Reader:
         }
 
     def _spheres(self, geoms: list[int]) -> Spheres:
-        m, centres, radii = self.m, [np.zeros((0, 3))], []
+        m, centres, directions, radii = self.m, [np.zeros((0, 3))], [np.zeros((0, 3))], []
         for geom in geoms:
             _, rotation, position = self.body[m.geom_bodyid[geom]]
             axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
             points, radius = contact_points(m, geom)
             centres.append(np.array([centre + axes @ point for point in points]))
+            along = {Geom.mjGEOM_CAPSULE: np.tile(axes[:, 2], (2, 1)), Geom.mjGEOM_BOX: points @ axes.T}
+            directions.append(along.get(Geom(m.geom_type[geom]), np.zeros_like(points)))
             radii.append(radius)
         counts = [len(points) for points in centres[1:]]
         links = np.array([self.body[m.geom_bodyid[geom]][0] for geom in geoms], np.int32)
         geom_of = np.repeat(np.array(geoms, np.int32), counts)
-        return Spheres(np.repeat(links, counts), np.concatenate(centres), np.repeat(radii, counts), geom_of)
+        each = np.repeat(links, counts), np.concatenate(centres), np.repeat(radii, counts)
+        return Spheres(*each, geom_of, np.concatenate(directions))
 
     def _outer(self, spheres: Spheres, slide: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Select, by link, spheres that are not inside another one in every pose: overlapping capsules count once."""

@@ -32,16 +32,18 @@ Row = tuple[str, ArrayLike | list[str], str]
 # Flags that the reader obeys, and flags that choose between MuJoCo's own numerical methods.
 OBEYED = {"constraint", "contact", "damper", "equality", "frictionloss", "gravity", "limit", "passive", "spring"}
 METHODS = {"autoreset", "clampctrl", "filterparent", "island", "midphase", "multiccd", "nativeccd", "refsafe", "sensor"}
-METHODS |= {"warmstart"}
+METHODS |= {"eulerdamp", "warmstart"}
 EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", "nativeccd", "sleep"}
 # Fields of a scene that may be infinite, and that are NaN where the file does not name them
 UNLIMITED, UNNAMED = {"lower", "upper", "force_low", "force_high"}, PENALTY_CONSTANTS
 
-# Arrays of MuJoCo's model that must be 0, of which only newer versions have some, and those that must not be negative
+# Arrays of MuJoCo's model that must be 0, of which only newer versions have some, finite, and not negative
 ZERO = """eq_active0 geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_dampingpoly pair_adhesion
     pair_solreffriction tendon_stiffness tendon_stiffnesspoly tendon_damping tendon_dampingpoly tendon_limited
     tendon_frictionloss tendon_armature tendon_actfrclimited tendon_springyield actuator_damping actuator_dampingpoly
     actuator_armature actuator_delay""".split()
+FINITE = """geom_friction geom_margin geom_gap geom_solmix geom_solref geom_solimp pair_friction pair_margin pair_gap
+    pair_solref pair_solimp jnt_margin jnt_solref jnt_solimp dof_solref dof_solimp""".split()
 POSITIVE = "jnt_stiffness dof_armature dof_damping dof_frictionloss geom_friction geom_solmix pair_friction".split()
 # What a file calls them, where that is another word
 WORDS = {"active0": "this constraint", "limited": "range", "actfrclimited": "actuatorfrcrange"}
@@ -81,6 +83,7 @@ def _file(m: mujoco.MjModel) -> Iterator[Row]:
     yield "option flag", sorted(disabled_flags(m) - OBEYED - METHODS), "cannot be disabled here"
     yield "option flag", sorted(enabled_flags(m) - EXTRAS), "cannot be enabled here"
     yield "option", ["wind"] * bool(np.any(m.opt.wind)), "only a fluid at rest is simulated"
+    yield "option", ["impratio"] * (not 0 < m.opt.impratio < np.inf), "must be positive and finite"
     yield "option", [name for name in ("density", "viscosity") if getattr(m.opt, name) < 0], "must not be negative"
     wrong = [name for name, values in constants.items() if len(values) > 1 or (values < 0).any()]
     yield "numeric", wrong, "must be one number, not negative"
@@ -90,13 +93,17 @@ def _file(m: mujoco.MjModel) -> Iterator[Row]:
 
 
 def _numbers(m: mujoco.MjModel) -> Iterator[Row]:
-    for field in (*ZERO, *POSITIVE):
-        prefix, _, name = field.partition("_")
-        wrong = np.array([np.any(each if field in ZERO else each < 0) for each in getattr(m, field, ())], bool)
-        if prefix == "dof":
-            wrong = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(wrong)])
-        why = "must not be negative" if field in POSITIVE else "is not simulated"
-        yield ELEMENTS.get(prefix, prefix), wrong, f"{WORDS.get(name, name)} {why}"
+    for fields, is_wrong, why in (
+        (ZERO, np.any, "is not simulated"),
+        (POSITIVE, lambda each: np.any(each < 0), "must not be negative"),
+        (FINITE, lambda each: not np.isfinite(each).all(), "must be finite"),
+    ):
+        for field in fields:
+            prefix, _, name = field.partition("_")
+            wrong = np.array([is_wrong(each) for each in getattr(m, field, ())], bool)
+            if prefix == "dof":
+                wrong = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(wrong)])
+            yield ELEMENTS.get(prefix, prefix), wrong, f"{WORDS.get(name, name)} {why}"
 
 
 def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
@@ -107,7 +114,7 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
     yield "body", m.body_mocapid >= 0, "mocap is not simulated"
-    yield "body", second, "a second base besides a floating one"
+    yield "body", second, "a second base besides a floating one; remove its joints and their actuators"
     yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
     yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
 
@@ -115,7 +122,7 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
 def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     limited, bounded = m.jnt_limited != 0, m.jnt_actfrclimited != 0
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
-    armature, loss = (values[m.jnt_dofadr] != 0 for values in (m.dof_armature, m.dof_frictionloss))
+    armature = m.dof_armature[m.jnt_dofadr] != 0
     fluid = m.opt.density + m.opt.viscosity > 0
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     tendons = (m.actuator_trntype == Transmission.mjTRN_TENDON).any()
@@ -123,7 +130,7 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     yield "joint", limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
     yield "joint", bounded & tendons, "actuatorfrcrange together with muscles is not simulated"
     yield "joint", bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
-    yield "joint", free & ((m.jnt_stiffness != 0) | loss), "a free joint has no stiffness or frictionloss here"
+    yield "joint", free & (m.jnt_stiffness != 0), "a free joint has no stiffness here; write <freejoint/>"
     yield "joint", free & armature & fluid, "armature of a free joint in a fluid is not simulated"
     yield "joint", free & ~first, "one free joint, of the first moving body, is simulated"
 
@@ -167,10 +174,22 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Row]:
     idle = tendon & ~motors(m) & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
     yield "actuator", off, "its group is in actuatorgroupdisable; remove the actuator"
     yield "actuator", tendon & ~pulls, f"only {ON_TENDON}"
-    yield "actuator", ~tendon & ~turns, f"only {ON_JOINT}, without activation dynamics, or muscles on tendons"
+    found = np.array([_unlike_a_motor(m, a) for a in range(count)])
+    for words in dict.fromkeys(found[~tendon & ~turns].tolist()):
+        yield "actuator", ~tendon & ~turns & (found == words), f"only {ON_JOINT}, or muscles on tendons, not {words}"
     yield "actuator", turns & negative, "stiffness and damping of a servo must not be negative"
     yield "actuator", pulls & idle, "its force follows from what it moves, and it moves nothing; give force"
     yield "actuator", bounded & (tendon | shared), "forcerange is simulated of a joint's only actuator"
+
+
+def _unlike_a_motor(m: mujoco.MjModel, a: int) -> str:
+    """Name what distinguishes an actuator from a motor or servo on a hinge, in the file's words."""
+    kinds = {"transmission": mujoco.mjtTrn, "dyntype": mujoco.mjtDyn, "gaintype": mujoco.mjtGain}
+    numbers = m.actuator_trntype[a], m.actuator_dyntype[a], m.actuator_gaintype[a]
+    for (name, kind), number, usual in zip(kinds.items(), numbers, ("joint", "none", "fixed"), strict=True):
+        if (word := kind(number).name.partition("_")[2].lower()) != usual:
+            return f"{name} {word}"
+    return "on this joint"
 
 
 def _turns(m: mujoco.MjModel) -> Mask:

@@ -51,6 +51,7 @@ class Spheres(NamedTuple):
     centre: Array  # (n, 3)
     radius: Array  # (n,)
     geom: Index  # (n,) the geom that each stands for
+    axis: Array  # (n, 3) a capsule's unit vector along it, of a box's corner its place from the centre [m], else 0
 
 
 class Constraints(NamedTuple):
@@ -59,8 +60,14 @@ class Constraints(NamedTuple):
     # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
     # midpoint and power; margin [m]
     contact: Array
+    axis: Array  # (nc, 3) see Spheres
     limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
     loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
+
+
+def takes_euler(m: mujoco.MjModel) -> bool:
+    """Tell whether MuJoCo's constraints are stepped as by its Euler, and not as by its implicitfast."""
+    return m.opt.integrator in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -174,7 +181,11 @@ class Scene:
     @property
     def features(self) -> frozenset[str]:
         """Return the features that the scene uses; the generated kernels contain no others."""
-        limited, constrained = np.isfinite(self.lower) | np.isfinite(self.upper), self.constraints is not None
+        limited, law = np.isfinite(self.lower) | np.isfinite(self.upper), self.constraints
+        opt, disabled = self.mj_model.opt, mujoco.mjtDisableBit
+        pyramidal = opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+        euler, off = law is not None and takes_euler(self.mj_model), opt.disableflags & int(disabled.mjDSBL_EULERDAMP)
+        damped, servos = bool(self.damping.any() or self.base_damping.any()), bool(self.servo_damping.any())
         present = {
             "floating": self.floating,
             "hinge": bool((~self.slide & (self.ball < 0))[1:].any()),
@@ -182,13 +193,17 @@ class Scene:
             "ball": self.nball > 0,
             "contact": self.ncontact > 0,
             "terrain": self.ncontact > 0 and self.terrain is not None,
-            "limit": bool((limited & ((self.k_limit != 0) | (self.d_limit != 0) | constrained)).any()),
-            "frictionloss": self.constraints is not None and bool(self.constraints.loss[:, 0].any()),
+            "pyramid": law is not None and pyramidal and bool(law.contact[:, 2].any()),
+            "box": law is not None and bool(law.axis[self.contact_radius == 0].any()),
+            "limit": bool((limited & ((self.k_limit != 0) | (self.d_limit != 0) | (law is not None))).any()),
+            "frictionloss": law is not None and bool(law.loss[:, 0].any()),
             "gravcomp": bool(self.lift.any() and self.gravity.any()),
             "base_damping": bool(self.base_damping.any()),
             "stiffness": bool(self.stiffness.any()),
-            "damping": bool(self.damping.any() or self.servo_damping.any()),
-            "clamp": bool((np.isfinite(self.force_low) | np.isfinite(self.force_high)).any()),
+            "damping": bool(self.damping.any()) or servos,
+            "explicit_servos": euler and servos,
+            "explicit_damping": euler and (damped or servos) and bool(off or not damped),
+            "clamp": bool((np.isfinite(self.force_low) | np.isfinite(self.force_high)).any()) or servos,
             "motor": bool((self.motor_link > 0).any()),
             "muscle": len(self.segment_muscle) > 0,
             "drag": self.density > 0 or self.viscosity > 0,

@@ -1,4 +1,4 @@
-"""How a control step is integrated: the contact model, the number of its substeps and how they are taken."""
+"""Integration of a control step: the contact model, the number of its substeps and how they are taken."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Integration(NamedTuple):
     """Options of the integrator; docs/physics.md has the equations.
 
     Attributes:
-        contact: "soft" (the SHAC paper's springs and dampers) or "mujoco" (MuJoCo's Euler and its own constraints for
+        contact: "soft" (the SHAC paper's springs and dampers) or "mujoco" (MuJoCo's own steps, with constraints for
             contact, limits and dry friction).
         substeps: integration steps per control step.
         implicit: only "soft": damping and friction act at the end of a substep. Otherwise it is semi-implicit Euler.

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import math
 import os
+import socket
 import sys
 import tempfile
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -26,10 +28,12 @@ COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_re
 def check_writable(directory: Path) -> None:
     """End the script if nothing can be written to a directory, which need not exist; leaves nothing behind."""
     try:
+        str(directory).encode()  # tensorboard writes it
         existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
-        tempfile.TemporaryFile(dir=existing).close()
-    except OSError as error:
-        fail(f"cannot write to run directory {directory}: {error.strerror}")
+        with tempfile.TemporaryFile(dir=existing) as file:
+            file.write(bytes(1000))  # a full disk has room for an empty file
+    except (OSError, UnicodeError) as error:
+        fail(f"cannot write to run directory {directory}: {getattr(error, 'strerror', 'its name is not UTF-8')}")
 
 
 def make_unused(wanted: Path) -> Path:
@@ -41,6 +45,29 @@ def make_unused(wanted: Path) -> Path:
         except FileExistsError:
             wanted = wanted.with_name(f"{wanted.name.partition('.')[0]}.{number}")
     raise AssertionError
+
+
+def lock(directory: Path) -> TextIO:
+    """End the script if another process runs in a directory; else keep others out until the file is closed.
+
+    The operating system holds the lock, so a killed process leaves none.
+    """
+    try:
+        file = (directory / "lock").open("a+")
+    except OSError as error:
+        fail(f"cannot write to run directory {directory}: {error.strerror}")
+    with suppress(ImportError):  # of Windows
+        import fcntl
+
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):  # others: the file system has no locks
+                file.seek(0)
+                fail(f"{directory} is in use by {file.read().strip()}: wait for its end, or choose another --run-dir")
+    file.truncate(0)
+    print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
+    return file
 
 
 class EpisodeStatistics:

@@ -188,6 +188,7 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
         return restored.evaluate()
 
     evaluation = measure(args)
+    pkgutil.resolve_name(checkpoint.PROVENANCE).compare(state.get("robot"), evaluation.scene)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     write_evaluation(args, evaluation, state["iteration"], **compare_finer(args, evaluation, measure))
 

@@ -116,6 +116,16 @@ def test_an_exported_policy_holds_a_clip_that_is_not_shipped_and_may_have_16_bit
     assert sizes[0] - sizes[1] == pytest.approx(2 * (224 + 1) * 29, abs=200)
 
 
+def test_weights_that_16_bits_cannot_hold_are_refused(tiny_run: Path, tmp_path: Path, capsys) -> None:
+    state = torch.load(tiny_run / "checkpoint.pt")
+    state["policy"]["weights"]["1.bias"][0] = 1e5
+    torch.save(state, path := tmp_path / "checkpoint.pt")
+    words = ["export", str(path), str(tmp_path / "policy.pt")]
+    error = refusal(lambda: command.main([*words, "--half"]), capsys)
+    assert error.endswith("weight 1.bias of the policy is too large for 16 bits") and [*tmp_path.iterdir()] == [path]
+    command.main(words)
+
+
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_onnx_takes_only_what_the_actor_sees(symmetric, tmp_path):
     torch.manual_seed(0)

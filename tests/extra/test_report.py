@@ -13,6 +13,13 @@ from diffsim.extra.commands import main
 from diffsim.extra.report import approximations, report
 from diffsim.robot.mjcf import load_scene
 
+LINK = '<body pos=".2 0 0"><joint axis="0 1 0"/><geom size=".02" pos=".1 0 0" contype="0" conaffinity="0"/></body>'
+
+
+def standing(root: str = "<freejoint/>", geom: str = "", option: str = "") -> str:
+    return robot(f'<body pos="0 0 0.1">{root}<geom size="0.1" {geom}/></body>', f"<option {option}/>")
+
+
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
@@ -51,10 +58,38 @@ def test_command(tmp_path, capsys):
     "mjcf, sentence",
     [
         (pendulum(rest='<actuator><motor name="m" joint="hinge"/></actuator>'), "actuators without ctrlrange: 'm'."),
-        (pendulum(inside='<geom size="0.1" condim="4"/>'), "Torsional and rolling friction, condim 4 and 6, are left"),
+        (
+            standing("<freejoint/>", 'condim="4"'),
+            "Left out: torsional and rolling friction (condim 4 and 6; it is 3 here). MuJoCo's steps change by ",
+        ),
+        (
+            standing('<joint type="free" frictionloss="1"/>'),
+            "Left out: frictionloss of a free joint (use <freejoint/>). MuJoCo's",
+        ),
+        (standing(option='noslip_iterations="9"'), "Left out: noslip_iterations. MuJoCo's steps change by "),
+        (standing(option='integrator="RK4"'), "Left out: integrator RK4, simulated as Euler. MuJoCo's"),
+        (
+            standing(f"<freejoint/>{LINK}", option='integrator="implicit"'),
+            "Left out: integrator implicit, simulated as implicitfast. MuJoCo's",
+        ),
+        (
+            standing(option='solver="PGS" iterations="3"'),
+            "Left out: a solver that may stop before it converges. MuJoCo's steps change",
+        ),
+        (
+            standing(option='integrator="implicitfast" viscosity="1"'),
+            "A fluid's drag is that of the velocity before a step; implicitfast takes the one after it.",
+        ),
+        (
+            pendulum(
+                rest='<actuator><position name="s" joint="hinge" ctrlrange="0 1"/></actuator><keyframe><key ctrl=".2"/>'
+                "</keyframe>"
+            ),
+            "Action 0 is the middle of a ctrlrange, not the ctrl of the file's keyframe: 0.5, not 0.2, of actuator 's'",
+        ),
         (
             pendulum(inside='<geom type="cylinder" size="1 2"/><geom type="ellipsoid" size="1 2 3"/>'),
-            "points of a shape: 8 of each rim of a cylinder, 14 of an ellipsoid's surface.",
+            "points of a shape: 8 of each rim of a cylinder (the shape reaches up to 76 mm beyond), 14 of an ellipsoid",
         ),
         (
             robot('<body name="base"><geom name="a" size="1"/><body><joint/><geom name="b" size=".1"/></body></body>'),

@@ -56,7 +56,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "joint 'hinge': stiffness must not be negative": pendulum('stiffness="-1"'),
     "joint 'hinge': a second number of stiffness is not simulated": pendulum('stiffness="1 2"'),
     "joint 'hip': the limit of a ball joint is not simulated": ball('range="0 1" limited="true"'),
-    "joint 'r': a free joint has no stiffness or frictionloss here": free('stiffness="1"'),
+    "joint 'r': a free joint has no stiffness here; write <freejoint/>": free('stiffness="1"'),
     "joint 'r': armature of a free joint in a fluid is not": free('armature="1"', '<option density="1"/>'),
     "joint 'j': actuatorgravcomp within actuatorfrcrange is not simulated": robot(
         f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BALL}</body>'
@@ -74,7 +74,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     ],
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),
-    "body 'post': a second base besides a floating one": robot(
+    "body 'post': a second base besides a floating one; remove its joints and their actuators": robot(
         f'<body><freejoint/>{BALL}</body><body name="post"><joint/>{BALL}</body>'
     ),
     "body 'hand': mocap is not simulated": pendulum(world=f'{FLOOR}<body name="hand" mocap="true"/>'),
@@ -95,6 +95,11 @@ REFUSED = {  # what the variants of test_variants.py have not
     "geom 'rock': its shape cannot touch the ground here; set contype": asset(
         'type="sdf" mesh="m"', '<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
     ),
+    "pair 'couple': margin must be finite": pair('margin="inf"'),
+    "joint 'hinge': margin must be finite": pendulum('margin="nan"'),
+    "option impratio: must be positive and finite": [
+        pendulum(rest=f'<option impratio="{number}"/>') for number in ("0", "-1", "nan", "inf")
+    ],
     "pair 'couple': friction differs by direction; it is isotropic here": pair('friction="1 2"'),
     "pair 'couple': friction must not be negative": pair('friction="-1 -1"'),
     # actuators
@@ -107,6 +112,11 @@ REFUSED = {  # what the variants of test_variants.py have not
         ball("", '<actuator><motor name="m" joint="hip" gear="1 1 0"/></actuator>'),
         ball("", '<actuator><position name="m" joint="hip" gear="1 0 0"/></actuator>'),
     ],
+    "or muscles on tendons, not dyntype filterexact": actuator("position", 'timeconst="0.1"'),
+    "or muscles on tendons, not gaintype affine": actuator("general", 'gaintype="affine"'),
+    "or muscles on tendons, not transmission jointinparent": pendulum(
+        rest='<actuator><motor name="m" jointinparent="hinge"/></actuator>'
+    ),
     "actuator 'm': forcerange is simulated of a joint's only": actuator(
         "motor", 'forcerange="-1 1"/><motor joint="hinge"'
     ),
