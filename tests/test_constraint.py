@@ -384,7 +384,8 @@ def test_tree_gradient_is_that_of_differences(base, seed, rng):
     assert in_mujoco(scene, *states)[2] == kinds_of_states(seed)
     check_gradients(scene, states, rng)
     if base in ("floating", "planar"):
-        check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (n, len(FACTORS)))})
+        few = [x[:16] for x in states]
+        check_gradients(scene, few, rng, {"factors": rng.uniform(0.7, 1.4, (16, len(FACTORS)))})
 
 
 @pytest.mark.parametrize("name", ["hopper", "sphere", *(pytest.param(name, marks=SLOW) for name in ("ant", "ball"))])
