@@ -58,7 +58,7 @@ PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # fmt: on
 MAX_GRAD_NORM = 100.0  # gradients of large values reach it
 MODEL_LR = 1e-3
-RETAIN = 4  # iterations whose imagined rollouts stay in the buffer
+ENHANCE_SCALE = 0.2  # distance of added states, in root mean square changes of a control step, and of actions
 TAU = 0.005  # target critics <- (1 - tau) target critics + tau critics, after each update
 LOG_STD = (-5.0, 2.0)  # bounds of the policy's log standard deviation
 LOG_VAR = (-10.0, 0.5)  # where the bounds of the models' log variance begin, in normalized units
@@ -93,10 +93,10 @@ class Args(Flags):
     """rollouts that each elite makes at once, branched from real states"""
     rollout_lengths: tuple[Count, Count] = (1, 1)
     """steps of a rollout at first and from half of the iterations on; they grow linearly between (per task)"""
+    retain: UpTo10k = 4
+    """iterations whose rollouts stay in the buffer"""
     sample_enhance: Natural = 0
     """SE-MBPO: transitions added around each real one with the simulator's Jacobians (0: MBPO)"""
-    enhance_scale: Positive = 0.2
-    """distance of added states, in root mean square changes of a control step, and of actions before tanh"""
     updates: UpTo10k = 160
     """gradient updates of actor, critics and temperature in an iteration"""
     batch_size: Batch = 256
@@ -230,7 +230,7 @@ class MBPO:
         self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.actor_lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
         self.model_optimizer = ClippedAdam(self.models, MAX_GRAD_NORM, lr=MODEL_LR)
-        imagined = RETAIN * args.elites * args.branches * args.rollout_lengths[1]
+        imagined = args.retain * args.elites * args.branches * args.rollout_lengths[1]
         held_out = max(args.steps * self.held_out, args.buffer_size // HELD_OUT)
         buffers = (ReplayBuffer(size, obs_dim, action_dim) for size in (args.buffer_size, held_out, imagined))
         self.real, self.unseen, self.imagined = (buffer.to(env.device) for buffer in buffers)
@@ -381,7 +381,7 @@ def nearby(system: System, x: Tensor, action: Tensor, samples: int, scale: float
 def enhance(mbpo: MBPO, state: Tensor, made: Transition) -> Transition:
     """Transitions near those made from states (n, nx), observed and rewarded as the task does (Qiao et al. 2021)."""
     args, task, nq = mbpo.args, mbpo.env.task, mbpo.system.nq
-    *near, finite = nearby(mbpo.system, state.double(), made.action.double(), args.sample_enhance, args.enhance_scale)
+    *near, finite = nearby(mbpo.system, state.double(), made.action.double(), args.sample_enhance, ENHANCE_SCALE)
     start, action, end = (x.to(state.dtype) for x in near)
 
     def observe(x: Tensor, action: Tensor) -> Tensor:

@@ -20,7 +20,6 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.mirror import Mirror
-from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, make_symmetric, mirror_inputs, mirror_outputs, mlp, moments
@@ -88,8 +87,7 @@ class Args(Flags):
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
-        own = {"symmetric": find_task(self.env).symmetric}
-        return super().task_defaults() | own | values | BALANCING.get(self.task, {})
+        return super().task_defaults() | values | BALANCING.get(self.task, {})
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -201,31 +199,28 @@ class PPO:
         return Batch(*(tensor.flatten(0, 1) for tensor in samples)), explained
 
     def learn(self, samples: Batch) -> dict[str, Tensor]:
-        """Descend the clipped loss (Eq. 7) in epochs of minibatches."""
-        old_log_std, metrics = self.actor_critic.log_std.detach().clone(), []
-        for _ in range(self.args.epochs):
+        """Descend the clipped loss (Eq. 7) in epochs of minibatches; the rate keeps the policy near the old one."""
+        args, policy, optimizer, metrics = self.args, self.actor_critic, self.optimizer, []
+        old_log_std = policy.log_std.detach().clone()
+        for _ in range(args.epochs):
             order = torch.randperm(len(samples.obs), device=self.env.device)
             for tensors in zip(*(tensor[order].chunk(self.minibatches) for tensor in samples), strict=True):
-                metrics.append(self.update(Batch(*tensors), old_log_std))
+                b = Batch(*tensors)
+                mean, value = policy(b.obs)
+                kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
+                adapt(optimizer.lr, distributed.average(kl), TARGET_KL, args.lr_bounds)
+                ratio = log_ratio(b, mean, policy.log_std, old_log_std).exp()
+                policy_loss = clipped_loss(ratio, b.advantage, CLIP)
+                value_loss = (value - b.target).square().mean()
+                bound_loss = (mean.abs() - BOUND).clamp(min=0).square().sum(-1).mean()
+                bonus = entropy(policy.log_std)
+                loss = policy_loss + VALUE_COEF * value_loss + BOUND_COEF * bound_loss - args.entropy_coef * bonus
+                gradient = optimizer.gradient(loss)
+                norm = optimizer.step(gradient)
+                clipped = ((ratio - 1).abs() > CLIP).to(kl.dtype).mean()
+                metrics.append(torch.stack((policy_loss, value_loss, bonus, kl, clipped, norm)).detach())
         names = "losses/policy_loss losses/value_loss losses/entropy losses/approx_kl losses/clipfrac grad/norm".split()
         return dict(zip(names, torch.stack(metrics).mean(0), strict=True))
-
-    def update(self, b: Batch, old_log_std: Tensor) -> Tensor:
-        """Take one step on a minibatch, with a learning rate that keeps the policy near the one that acted."""
-        policy, optimizer = self.actor_critic, self.optimizer
-        mean, value = policy(b.obs)
-        kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
-        adapt(optimizer.lr, distributed.average(kl), TARGET_KL, self.args.lr_bounds)
-        ratio = log_ratio(b, mean, policy.log_std, old_log_std).exp()
-        policy_loss = clipped_loss(ratio, b.advantage, CLIP)
-        value_loss = (value - b.target).square().mean()
-        bound_loss = (mean.abs() - BOUND).clamp(min=0).square().sum(-1).mean()
-        bonus = entropy(policy.log_std)
-        loss = policy_loss + VALUE_COEF * value_loss + BOUND_COEF * bound_loss - self.args.entropy_coef * bonus
-        gradient = optimizer.gradient(loss)
-        norm = optimizer.step(gradient)
-        clipped = ((ratio - 1).abs() > CLIP).to(kl.dtype).mean()
-        return torch.stack((policy_loss, value_loss, bonus, kl, clipped, norm)).detach()
 
 
 @torch.no_grad()

@@ -21,8 +21,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
 from diffsim.extra.learning.ensemble import Ensemble, EnsembleAdam
-from diffsim.extra.mirror import Mirror
-from diffsim.tasks import TASKS, find_task
+from diffsim.tasks import TASKS
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, make_symmetric, mirror_inputs, mirror_outputs, mlp
@@ -60,10 +59,8 @@ ON_CPU: dict[str, dict[str, Any]] = {
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
 # fmt: on
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
-LAMBDA = 0.95  # of the value estimation
-MINIBATCHES = 4  # of a pass over a rollout's samples, contiguous in time
-BETAS = 0.7, 0.95  # Adam's decay rates of the gradient's first and second moment
-MAX_GRAD_NORM = 1.0
+LAMBDA, MINIBATCHES = 0.95, 4  # of the value estimation; of a pass over a rollout's samples, contiguous in time
+MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of the optimizers; Adam's decay rates of the gradient's moments
 FINAL_LR = 1e-5  # the learning rates of actor and critics reach it, linearly, after the last iteration
 TEMPERATURE_LR = 5e-3  # of the temperature's logarithm
 SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
@@ -123,8 +120,7 @@ class Args(Flags):
         if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
             how = INTEGRATION[self.task]
             values |= {"substeps": how.substeps, "implicit": how.implicit}
-        own = {"symmetric": find_task(self.env).symmetric}
-        return super().task_defaults() | own | values | BALANCING.get(self.task, {})
+        return super().task_defaults() | values | BALANCING.get(self.task, {})
 
     def check(self) -> None:
         super().check()
@@ -170,18 +166,6 @@ class Actor(nn.Module):
         return nn.Sequential(self.normalizer, *self.body[member], *self.mean[member], nn.Tanh())
 
 
-def make_alike(actor: Actor, critics: Ensemble, mirror: Mirror) -> None:
-    """Treat left and right alike: mirrored states get mirrored actions with the same noise, and the same value."""
-    actor.normalizer.mirror = mirror.obs
-    for inputs in (actor.body, critics):
-        mirror_inputs(inputs.layers, mirror.obs)
-    mirror_outputs(actor.mean.layers, mirror.action)
-    mirror_outputs(critics.layers, mirror.value)
-    if actor.spread is not None:
-        mirror_outputs(actor.spread.layers, mirror.size)
-    make_symmetric(actor, "log_std", mirror.action)
-
-
 # The algorithm --------------------------------------------------------------------------------------------------------
 
 
@@ -210,7 +194,7 @@ class SAPO:
         critics = [mlp(env.task.obs_dim, *options, norm=True, orthogonal=True) for _ in range(args.critics * K)]
         self.critics = Ensemble(critics).to(env.device)
         if args.symmetric:
-            make_alike(self.actor, self.critics, env.task.mirror)
+            self.make_alike()
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.temperature = nn.ParameterDict({"log": torch.zeros(K)}).to(env.device)  # the entropy's weight
         score = {"reward": torch.zeros(K), "tied": torch.zeros(())}  # running mean reward; whether all members are one
@@ -221,6 +205,17 @@ class SAPO:
         self.temperature_optimizer = EnsembleAdam(self.temperature, 1, K, *limits)
         self.temperature_optimizer.lr.fill_(TEMPERATURE_LR)
         self.target_entropy = torch.zeros((), device=env.device)
+
+    def make_alike(self) -> None:
+        """Treat left and right alike: mirrored states get mirrored actions with the same noise, and the same value."""
+        mirror, actor = self.env.task.mirror, self.actor
+        actor.normalizer.mirror = mirror.obs
+        for inputs in (actor.body, self.critics):
+            mirror_inputs(inputs.layers, mirror.obs)
+        outputs = [(actor.mean, mirror.action), (self.critics, mirror.value)]
+        for network, output in outputs + ([(actor.spread, mirror.size)] if actor.spread else []):
+            mirror_outputs(network.layers, output)
+        make_symmetric(actor, "log_std", mirror.action)
 
     @property
     def optimizers(self) -> tuple[EnsembleAdam, ...]:
@@ -354,8 +349,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
     """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
-    returns = torch.empty_like(reward)
-    following = next_value[-1]
+    returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))
         following = returns[t] = reward[t] + gamma * following

@@ -21,8 +21,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.extra.mirror import Mirror
-from diffsim.tasks import find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, make_symmetric, mirror_inputs, mirror_outputs, mlp
@@ -51,8 +49,7 @@ BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"
 GAIN = dict.fromkeys(BEGINNING, 0.01)  # factor of the weights of the actor's last layer at first, otherwise 1
 ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  # where environments cost little
 # fmt: on
-BETAS = 0.7, 0.95  # Adam's decay rates of the gradient's first and second moment
-MAX_GRAD_NORM = 1.0
+MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of both optimizers; Adam's decay rates of the gradient's moments
 FINAL_LR = 1e-5  # both learning rates reach it, linearly, after the last iteration
 ELU = partial(nn.ELU, inplace=True)
 
@@ -100,8 +97,7 @@ class Args(Flags):
             values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
         if self.device != "cpu":
             values |= ON_GPU.get(self.task, {})
-        own = {"symmetric": find_task(self.env).symmetric}
-        return super().task_defaults() | own | values | BEGINNING.get(self.task, {})
+        return super().task_defaults() | values | BEGINNING.get(self.task, {})
 
     def check(self) -> None:
         super().check()
@@ -119,8 +115,7 @@ class Actor(nn.Module):
         super().__init__()
         obs_dim, action_dim, noiseless = env.task.obs_dim, env.scene.nu, args.initial_log_std == -math.inf
         self.normalizer = ObsNormalizer(obs_dim)
-        options: dict[str, Any] = dict(norm=True, orthogonal=noiseless, columns=env.task.actor_dim)
-        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, ELU, **options)
+        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, ELU, True, noiseless, env.task.actor_dim)
         if args.task in GAIN:
             with torch.no_grad():
                 self.mean[-1].get_parameter("weight").mul_(GAIN[args.task])
@@ -138,15 +133,6 @@ class Actor(nn.Module):
     def deterministic(self) -> nn.Sequential:
         """Return the policy without noise, with the same weights."""
         return Chain(self.normalizer, *self.mean, nn.Tanh())
-
-
-def make_alike(actor: Actor, critic: nn.Sequential, mirror: Mirror) -> None:
-    """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
-    actor.normalizer.mirror = mirror.obs
-    for network, output in ((actor.mean, mirror.action), (critic, mirror.value)):
-        mirror_inputs(network, mirror.obs)
-        mirror_outputs(network, output)
-    make_symmetric(actor, "log_std", mirror.action)
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -170,11 +156,20 @@ class SHAC:
         self.actor = Actor(args, env).to(env.device)
         self.critic = mlp(env.task.obs_dim, args.critic_hidden, 1, ELU, norm=True, orthogonal=True).to(env.device)
         if args.symmetric:
-            make_alike(self.actor, self.critic, env.task.mirror)
+            self.make_alike()
         self.policy = self.actor.deterministic()
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS)
         self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
+
+    def make_alike(self) -> None:
+        """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
+        mirror = self.env.task.mirror
+        self.actor.normalizer.mirror = mirror.obs
+        for network, output in ((self.actor.mean, mirror.action), (self.critic, mirror.value)):
+            mirror_inputs(network, mirror.obs)
+            mirror_outputs(network, output)
+        make_symmetric(self.actor, "log_std", mirror.action)
 
     def iterate(self) -> dict[str, Tensor]:
         """One iteration of Algorithm 1; returns metrics.
@@ -233,8 +228,7 @@ class SHAC:
 
 def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
     """Take H steps of all environments from where they stand, with the policy's noise (H, N, action_dim)."""
-    steps = []
-    obs = env.detach()  # no gradient goes back to the steps before
+    steps, obs = [], env.detach()  # no gradient goes back to the steps before
     for step_noise in noise.unbind():
         next_obs, reward, terminated, truncated, info = env.step(actor(obs, step_noise))
         steps.append((obs, info["final_obs"], reward, terminated, terminated | truncated))
@@ -256,8 +250,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
     """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the rollout's end does."""
-    returns = torch.empty_like(reward)
-    following = next_value[-1]
+    returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))
         following = returns[t] = reward[t] + gamma * following

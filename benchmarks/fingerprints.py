@@ -3,9 +3,7 @@
 `python benchmarks/paper.py --same REVISION` compares a revision with this one on this machine; with --update-results
 it adds a link to results/fingerprints.csv. A result counts while each link from its revision to the newest one keeps
 the fingerprints that its training depends on, its learner's and those of its task, and while a preset that it was
-trained with (--accuracy fast) is the same. A link keeps a fingerprint that is
-equal in both revisions, or that was meant to change (--reason) if all sentinels that depend on it, cells that were
-trained again, are within the published range.
+trained with (--accuracy fast) is the same. A link that differs gives its --reason.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,20 +23,17 @@ import common
 import tables
 from tables import ROOT
 
+from diffsim.extra.commands import find_learners
 from diffsim.training import fail
 
-CASES = {  # small trainings
-    # each learner
-    "shac": "shac --env hopper --num-envs 16",
-    "sapo": "sapo --env hopper --num-envs 16",
+CASES = {name: f"{name} --env hopper --num-envs 16" for name in find_learners()}  # small trainings
+CASES |= {  # learners that need other flags
     "population": "sapo --env hopper --population 2 --num-envs 16",
-    "bptt": "bptt --env hopper --num-envs 16",
     "pods": "pods --env cartpole --num-envs 16",
     "ppo_baseline": "ppo_baseline --env hopper --minibatch-size 512 --num-envs 16",
     "sac_baseline": "sac_baseline --env hopper --num-envs 16 --seed-steps 32",
     "mbpo": "mbpo --env hopper --num-envs 16 --seed-steps 16 --model-updates 4 --updates 4 --sample-enhance 1",
     "pfpn": "pfpn --env hopper --minibatch-size 512 --num-envs 16",
-    "pfpn_sac": "pfpn_sac --env hopper --num-envs 16",
     "gps": "gps --env cartpole --samples 4 --guiding-samples 4 --active 8 --horizon 20 --ilqr-iterations 2",
     # the physics and the tasks
     "cartpole": "shac --env cartpole --num-envs 16",
@@ -64,8 +59,7 @@ except SystemExit as end:
 state = torch.load(f"{sys.argv[-1]}/checkpoint.pt", map_location="cpu", weights_only=False)
 print(hashlib.sha256(b"".join(w.numpy().tobytes() for w in state["policy"]["weights"].values())).hexdigest()[:12])
 """  # in the process of the checkout, which knows what its checkpoint holds
-COLUMNS = ("revision", "parent", "machine", "equal", "differ", "reason", "sentinels")
-KEEPS, BREAKS = "within", "beyond"  # verdicts on a sentinel: of the published range
+COLUMNS = ("revision", "parent", "machine", "equal", "differ", "reason")
 
 
 def depends(command: str) -> set[str]:
@@ -139,13 +133,6 @@ def same_files(revision: str, other: str, script: str = "") -> bool:
     return subprocess.run(call, cwd=ROOT, stderr=subprocess.DEVNULL).returncode == 0
 
 
-def keeps(link: Mapping[str, str], name: str) -> bool:
-    """Whether results of a link's parent that depend on a fingerprint are results of its revision, too."""
-    told = (words.partition(":")[0].rpartition(" ") for words in filter(None, link["sentinels"].split("; ")))
-    verdicts = {verdict for command, _, verdict in told if name in depends(command)}
-    return name in link["equal"].split() or bool(link["reason"]) and verdicts == {KEEPS}
-
-
 @functools.cache
 def preset(revision: str, command: str) -> list[str]:
     """What a task's file sets for --accuracy fast at a revision: substeps, "implicit"; empty for another training."""
@@ -168,7 +155,7 @@ def counts(revision: str, command: str) -> bool:
             return False
         if same_files(revision, link["revision"], script):
             return True
-        if not all(keeps(link, name) for name in names):
+        if not names <= {*link["equal"].split()}:
             return False
         if same_files(revision, at := link["parent"], script):
             return True
@@ -199,5 +186,5 @@ def record(args: common.CommonFlags, revision: str, reason: str) -> None:
         if differ and not reason:
             fail("not recorded: a change that means to move numbers says why (--reason, and a line in CHANGELOG.md)")
         machine = tables.origin(args.device).removeprefix("# ").partition("; ")[0]
-        values = tables.revision(), revision, machine, " ".join(equal), " ".join(differ), reason if differ else "", ""
+        values = tables.revision(), revision, machine, " ".join(equal), " ".join(differ), reason if differ else ""
         tables.replace_csv(path(), [dict(zip(COLUMNS, values, strict=True))], ("revision",), args.device)

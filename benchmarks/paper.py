@@ -7,7 +7,6 @@
     python benchmarks/paper.py --machine h200 --evaluate-only --update-results    and evaluate there
     python benchmarks/paper.py --draw-only --update-results        only the tables and pictures
     python benchmarks/paper.py --same REVISION --update-results    record whether this revision trains the same policies
-    python benchmarks/paper.py --sentinels --update-results        measure sentinels after a change of numbers
 
 Groups of cells are in cases.json: learners on tasks of a machine, by seeds. A cell counts while no revision since its
 own has changed its numbers (fingerprints.py). Writes cells.csv, a line for each, and curves.csv, some POINTS of each
@@ -29,7 +28,6 @@ import cells
 import common
 import fingerprints
 import numpy as np
-import tables
 from cells import GROUPS, LEARNERS, RETURNS, Cell, Curve, Group, Runner, ScriptFlags, curve, evaluation, read_cells
 from common import LEARNT, Line, Panel, Tasks, check_names, plot, run
 from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, read_csv
@@ -39,7 +37,6 @@ from diffsim.training import Natural, checkpoint
 
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
-SENTINELS = 3  # cells, each with as many seeds
 TIMED = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")  # that a page shows
 
 
@@ -57,7 +54,6 @@ class Args(ScriptFlags):
     shared: bool = False  # the machine did other work beside the trainings: their seconds are left out
     same: str = ""  # a revision: only say whether this one trains the same policies
     reason: str = ""  # with --same: why some differ
-    sentinels: bool = False  # after a change of numbers, train some cells again and compare them with their range
 
     def alone(self, cell: Cell) -> bool:
         """Whether a cell's seconds mean something."""
@@ -283,39 +279,6 @@ def check(args: Args) -> str:
     return "\n".join(lines)
 
 
-def sentinels(args: Args, differ: set[str]) -> list[tuple[str, str]]:
-    """Learners and tasks of this machine that depend on these: first on most of them, and of several the shortest."""
-    rows, chosen, left = read_csv(common.RESULTS / args.place / "cells.csv"), list[tuple[str, str]](), {*differ}
-    steps = {(row["learner"], row["task"]): float(row["control steps"]) for row in rows}
-    depends = {key: fingerprints.depends(f"{LEARNERS[key[0]]} --env {key[1]}") for key in steps}
-    while len(chosen) < SENTINELS and (others := [key for key in steps if key not in chosen and depends[key] & differ]):
-        chosen.append(max(others, key=lambda key: (len(depends[key] & left), -steps[key])))
-        left -= depends[chosen[-1]]
-    return chosen
-
-
-def measure_sentinels(args: Args, runner: Runner) -> None:
-    """Train sentinels at this revision, and say in the newest link whether medians are within the published range."""
-    link, verdicts = fingerprints.links()[-1], list[str]()
-    for learner, task in sentinels(args, {*link["differ"].split()}):
-        own = [Cell(args.place, learner, task, seed) for seed in range(1, SENTINELS + 1)]
-        cases = [cell.case(args.runs / "sentinels" / link["revision"]) for cell in own]
-        for cell, case in zip(own, cases, strict=True):
-            cells.begin(runner, cell, case)
-            if not (runner.train(case) and runner.evaluate(case)):
-                return
-        rows = (row for row in read_csv(common.RESULTS / args.place / "cells.csv") if row["task"] == task)
-        known = numbers((row for row in rows if row["learner"] == learner), "return")
-        found = median(evaluation(case.folder)["return"] for case in cases)
-        verdict = fingerprints.KEEPS if min(known) <= found <= max(known) else fingerprints.BREAKS
-        told = f"{verdict}: {found:.0f} in {min(known):.0f} to {max(known):.0f}"
-        verdicts.append(f"{LEARNERS[learner]} --env {task} {told}")
-        print(verdicts[-1], flush=True)
-    if args.update_results:
-        link = link | {"sentinels": "; ".join(verdicts)}
-        tables.replace_csv(fingerprints.path(), [link], ("revision",), args.device)
-
-
 def main(args: Args) -> None:
     check_names("--only", args.only, GROUPS)
     check_names("--learners", args.learners, LEARNERS)
@@ -326,9 +289,6 @@ def main(args: Args) -> None:
         fingerprints.record(args, args.same, args.reason)
         return
     runner = Runner(args)
-    if args.sentinels:
-        measure_sentinels(args, runner)
-        return
     for cell in () if args.draw_only else wanted(args):
         if cell.machine != args.place:
             continue

@@ -28,7 +28,6 @@ import diffsim
 from diffsim import Scene, Simulator
 from diffsim.extra.terrain import rough
 from diffsim.extra.tune.front import clock
-from diffsim.kernels.lanes import divide
 from diffsim.sim.launcher import TooLargeError
 from diffsim.training import Count, fail, graph
 
@@ -197,7 +196,7 @@ def scaling_row(device: str, name: TaskName, num_envs: int, horizon: int, techni
     torch.cuda.synchronize()
     free = torch.cuda.mem_get_info()[0]
     default, env = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs, device, seed=0)
-    division = divide(env.scene) if "one thread" in technique else None
+    division = (1, 1) if "one thread" in technique else None
     sim = Simulator(env.scene, num_envs, default, horizon=horizon, device=device, division=division)
     actions = (torch.rand(horizon, num_envs, sim.nu, device=env.device) * 2 - 1).requires_grad_()
     calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]

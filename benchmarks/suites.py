@@ -39,7 +39,6 @@ SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",
     "percent": lambda values: f"{mean(values):.1%}",
-    "counts": lambda values: ", ".join(f"{value:.0f}" for value in values),
     "each": lambda values: ", ".join(f"{value:.1f}" for value in values),
     "each, rounded": lambda values: ", ".join(f"{value:.0f}" for value in values),
     "all": lambda values: "-".join(dict.fromkeys(f"{value:.0f}" for value in (min(values), max(values)))),

@@ -6,7 +6,6 @@
 A policy acts from the same start states in several worlds, of which each step changes one thing:
 
     here         this simulator, as in training
-    finer        this simulator with finer steps, not implicit ones: the integration
     MuJoCo same  of contact mujoco: MuJoCo with the substeps and the elliptic cones of the training: the same law
     MuJoCo x1    MuJoCo with its own contact and limits, cones and timestep on the same file
     MuJoCo x0.5  and so on, with other friction
@@ -31,10 +30,9 @@ from tables import Row, grouped, middle, numbers
 from worlds import Here, Motion, MuJoCo, World, travel
 
 import diffsim
-from diffsim import DiffEnv, Simulator
+from diffsim import DiffEnv
 from diffsim.training import Count, Positive, fail
 from diffsim.training.checkpoint import HOME
-from diffsim.training.evaluation import FINER
 
 SAME = "MuJoCo same"  # with the law and the substeps of contact mujoco
 
@@ -44,7 +42,6 @@ class Args(common.CheckpointFlags):
     episodes: Count = 64  # start states, the same in every world
     steps: Count = 1000  # control steps at most
     friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # friction in MuJoCo, in multiples of the file's mu
-    finer: Count = FINER  # steps of "finer" in multiples of the task's substeps
 
 
 def speed(motion: Motion, control_dt: float, forward: int) -> float:
@@ -77,9 +74,8 @@ def conditions(case: Case, args: Args) -> dict[str, World]:
     """The worlds, by the names that the csv gives them; the first is that of the training."""
     env, scene, n, how = case.env, case.env.scene, case.env.num_envs, case.env.sim.integration
     exact, dt = how.contact == "mujoco", env.control_dt
-    finer = how._replace(substeps=args.finer * (how.substeps if exact else env.task.substeps), implicit=False)
     worlds: dict[str, World] = {SAME: MuJoCo(scene, n, dt, 1.0, exact, how.substeps)} if exact else {}
-    worlds |= {"here": Here(env.sim), "finer": Here(Simulator(scene, n, finer, dt, device=env.device))}
+    worlds |= {"here": Here(env.sim)}
     first = SAME if exact and case.saved.simulator != HOME else "here"
     for friction in args.friction if scene.ncontact else (1.0,):
         worlds[f"MuJoCo x{friction:g}"] = MuJoCo(scene, n, dt, friction, own_friction=exact)
@@ -95,7 +91,6 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         fail(f"{trained_on} muscles are not simulated in MuJoCo here")
     if env.task.num_memory:
         fail(f"{trained_on} policy depends on the past: choose one of another task")
-    flags = {"episodes": args.episodes, "steps": args.steps, "finer": args.finer}
     for name, world in conditions(case, args).items():
         motion = travel(case, world, args.steps)
         row = case.about | {"trained in": case.saved.simulator, "condition": name}
@@ -103,7 +98,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         if isinstance(value := row["speed"], float):
             own = value if math.isnan(own) else own
             row["kept"] = value / own
-        yield row | flags
+        yield row | {"episodes": args.episodes, "steps": args.steps}
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -33,23 +33,17 @@ GROUND_LAW = "condim friction solref solimp solmix priority margin gap contype c
 mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable, which World.step says
 
 
-class World(Protocol):
-    """N robots in a simulator, whose state is the caller's."""
-
-    def step(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """qpos (N, nq) and qvel (N, nv) after a control step, and which robots (N,) left the finite numbers.
-
-        These stay as they were.
-        """
-
-
 class Here:
-    """This simulator."""
+    """N robots in this simulator, whose state is the caller's."""
 
     def __init__(self, sim: Simulator) -> None:
         self.sim = sim
 
     def step(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return qpos (N, nq) and qvel (N, nv) after a control step, and which robots (N,) left the finite numbers.
+
+        These stay as they were.
+        """
         new = self.sim.step(*(x.to(self.sim.device, self.sim.dtype) for x in (qpos, qvel, action)))
         return new[0].to(qpos), new[1].to(qvel), self.sim.nonfinite.to(qpos.device, copy=True)
 
@@ -141,6 +135,9 @@ def on_terrain(spec: mujoco.MjSpec, profile: Array) -> mujoco.MjModel:
     for plane in planes:
         spec.delete(plane)
     return spec.compile()
+
+
+World = Here | MuJoCo
 
 
 class OtherFile(MuJoCo):

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from diffsim import startup
 from diffsim.env import DiffEnv, check_seed
-from diffsim.kernels.lanes import Division
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration, check_count
@@ -21,6 +20,7 @@ from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, Task, TaskError, find_task
 
+__version__ = "1.0.0"
 __all__ = [
     "TASKS",
     "DiffEnv",
@@ -60,7 +60,7 @@ def make(
     factors: bool = False,
     forces: bool = False,
     block: int | None = None,
-    division: Division | None = None,
+    division: tuple[int, int] | None = None,
     **unknown: Any,
 ) -> DiffEnv:
     """Build the tensor environment of a task.
@@ -96,7 +96,7 @@ def make(
         threads: CPU threads of the kernels. Default: as many as have work.
         factors, forces: enable Simulator.factors (constants that differ between environments), Simulator.forces.
         block: environments per vector of a CPU thread, 1, 8 or 16. Default: the fastest.
-        division: distribution of an environment over GPU threads. Default: the fastest.
+        division: GPU threads of an environment, and how many of them share each limb. Default: the fastest.
 
     Returns:
         A gymnasium.vector.VectorEnv on torch tensors: observations (N, obs_dim), actions (N, nu) in [-1, 1], rewards

@@ -13,10 +13,10 @@ from browser import CHROMIUM, Browser
 
 import shac
 from diffsim.extra import render
-from diffsim.training import evaluation
+from diffsim.training import Evaluation
 
 torch.set_num_threads(1)
-evaluation.FINER = 0  # runs end without a second evaluation; tests of it set it again
+Evaluation.compared = False  # except in the tests of that
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it to what they run in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

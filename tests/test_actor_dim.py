@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,30 +12,29 @@ import pytest
 import torch
 from learners import refusal
 
-import bptt
 import diffsim
 import gps
-import mbpo
-import pfpn
-import pfpn_sac
-import pods
-import ppo_baseline
-import sac_baseline
-import sapo
-import shac
+from diffsim.extra.commands import find_learners
 from diffsim.tasks import TASKS
 from diffsim.training import parse
 
-LEARNERS = [shac.SHAC, sapo.SAPO, bptt.BPTT, pods.PODS, ppo_baseline.PPO, sac_baseline.SAC, mbpo.MBPO]
+
+def algorithm(script: str) -> Any:
+    """The class of a script that is made of its arguments and environments."""
+    own = [each for each in vars(importlib.import_module(script)).values() if getattr(each, "__module__", "") == script]
+    kinds = [kind for kind in own if inspect.isclass(kind) and [*inspect.signature(kind).parameters] == ["args", "env"]]
+    (kind,) = [kind for kind in kinds if not issubclass(kind, torch.nn.Module)]
+    return kind
 
 
 class Blinkered(TASKS["cartpole"]):  # type: ignore[misc]
     actor_dim = 3
 
 
-@pytest.mark.parametrize("kind", [*LEARNERS, pfpn.PPO, pfpn_sac.SAC], ids=lambda kind: kind.__module__)
-def test_a_policy_uses_what_its_actor_sees(kind: Any) -> None:
-    args = parse(sys.modules[kind.__module__].Args, "--env cartpole --device cpu --num-envs 2".split())
+@pytest.mark.parametrize("script", sorted({*find_learners()} - {"gps"}))
+def test_a_policy_uses_what_its_actor_sees(script: str) -> None:
+    kind = algorithm(script)
+    args = parse(sys.modules[script].Args, "--env cartpole --device cpu --num-envs 2".split())
     policy = kind(args, diffsim.make(Blinkered, num_envs=2, horizon=240)).policy
     obs = torch.randn(9, 5)
     hidden, seen = obs.clone(), obs.clone()

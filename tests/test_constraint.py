@@ -32,8 +32,8 @@ from test_gradient import differences, gradients, weights
 from test_terrain import HILLS, everywhere, hopping, pressed
 
 import diffsim
+from diffsim.extra.gait import trace
 from diffsim.extra.terrain import incline
-from diffsim.robot.contact import trace
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS
 from diffsim.sim import simulator

@@ -284,7 +284,8 @@ def test_what_is_where_names_all_scripts_and_packages_once() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text()
     (section,) = re.findall(r"^## What is where\n\n```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     first = [line.split()[0] for line in section.splitlines() if re.match(r" *[\w./]+ {2}", line)]
-    packages = [f"{path.parent.name}/" for path in (ROOT / "diffsim").glob("*/__init__.py")]
+    rooms = [*(ROOT / "diffsim").glob("*/__init__.py"), *(ROOT / "diffsim" / "extra").glob("*/__init__.py")]
+    packages = [f"{path.parent.name}/" for path in rooms]
     folders = [f"{name}/" for name in ("diffsim", "benchmarks", "tests", "examples", "tools")]
     assert sorted(first) == sorted([*(path.name for path in ROOT.glob("*.py")), *packages, *folders])
 

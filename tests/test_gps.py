@@ -18,7 +18,7 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.extra.planning import LinearGaussian, System, save_demonstration
-from diffsim.training import evaluate, load_policy, make_policy_env, parse
+from diffsim.training import Evaluation, evaluate, load_policy, make_policy_env, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from gps import log_mixture, phi, sparse
@@ -278,9 +278,12 @@ def test_rows_and_files_of_a_run(trained: Path, rows: list[dict[str, str]]) -> N
     assert not list(trained.glob("*.tmp"))
 
 
-def test_evaluation(trained: Path, rows: list[dict[str, str]], tmp_path: Path, search: gps.Search) -> None:
+def test_evaluation(
+    trained: Path, rows: list[dict[str, str]], tmp_path: Path, search: gps.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It repeats the last one of training and leaves the run as it was; one of its trajectories has no noise."""
     before = {path: path.read_bytes() for path in trained.iterdir()}
+    monkeypatch.setattr(Evaluation, "compared", True)
     gps.main(["--evaluate", str(trained / "checkpoint.pt"), "--run-dir", str(tmp_path)])
     assert before == {path: path.read_bytes() for path in trained.iterdir()}
     again, training = (json.loads((path / "evaluation.json").read_text()) for path in (tmp_path, trained))

@@ -99,8 +99,7 @@ def episode(
     scene = start.scene
     if integration:
         scene = scene.with_terrain(np.stack([rough(seed, degrees=4.0, start=-2.5) for seed in range(n)]))
-    division = divide(scene, *team) if team else None
-    kwargs |= dict(device=device, division=division, **dict.fromkeys(("factors", "forces"), integration is not None))
+    kwargs |= dict(device=device, division=team, **dict.fromkeys(("factors", "forces"), integration is not None))
     sim = Simulator(scene, n, integration or start.sim.integration, start.control_dt, HORIZON, **kwargs)
     qpos, qvel, steps, *optional = inputs
     if optional:

@@ -87,9 +87,16 @@ def test_numbers_of_threads_are_checked(team: tuple[int, int]) -> None:
 
 def test_a_cpu_has_one_thread_for_an_environment() -> None:
     scene = task_scene("cartpole")
-    diffsim.Simulator(scene, 1, division=divide(scene))
+    diffsim.Simulator(scene, 1, division=(1, 1))
     with pytest.raises(ValueError, match="threads_per_env is 2, must be 1 on a CPU"):
-        diffsim.Simulator(scene, 1, division=divide(scene, 2))
+        diffsim.Simulator(scene, 1, division=(2, 1))
+
+
+def test_a_division_has_the_spheres_of_the_contact_model() -> None:
+    """MuJoCo's contact has spheres of its own; with the division of soft contact, most of them would be left out."""
+    for contact, count in (("soft", 13), ("mujoco", 25)):
+        sim = diffsim.Simulator(task_scene("ant"), 1, diffsim.Integration(contact, 4), division=(1, 1))
+        assert len(sim._launcher._model.contact_radius) == count
 
 
 def motors_among_muscles() -> diffsim.Scene:

@@ -86,7 +86,7 @@ def test_a_learner_trains(tmp_path, monkeypatch):
     command.main(["train", "shac", *flags.split(), str(tmp_path / "run")])
     assert load_policy(tmp_path / "run" / "checkpoint.pt").script == "shac"
     (tmp_path / "learners").mkdir()
-    (tmp_path / "learners" / "shac.py").write_text("raise SystemExit(7)")
+    (tmp_path / "learners" / "shac.py").write_text("raise SystemExit(7)\nmain = script(None)")
     monkeypatch.setattr(command, "PACKAGE", tmp_path)
     with pytest.raises(SystemExit, match="7"):
         command.main(["train", "shac", "--env", "nothing"])
@@ -121,8 +121,8 @@ def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
     [
         ("demo nothing", "unknown task 'nothing': choose from cartpole, hopper"),
         ("demo hopper", "no policy for hopper is shipped; there are: none"),
-        ("train nothing --env ant", "unknown learner 'nothing': choose from shac, sapo"),
-        ("train", "Missing from diffsim train: {{shac,sapo,"),
+        ("train nothing --env ant", "unknown learner 'nothing': choose from bptt, gps, mbpo"),
+        ("train", "Missing from diffsim train: {{bptt,gps,"),
         ("demo --nothing", "Unrecognized options: --nothing; For full helptext, run diffsim --help"),
         ("export {tmp}/nothing.pt {tmp}/new/out.pt", "no such checkpoint: {tmp}/nothing.pt"),
         ("export {trained} {trained}/out.pt", "File exists"),

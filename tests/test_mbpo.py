@@ -141,8 +141,7 @@ def test_held_out_environments_are_not_learnt_from() -> None:
 
 def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Real states are -1; each step adds 1; what passes 2 has failed; the length rises over half of the iterations."""
-    monkeypatch.setattr(mbpo, "RETAIN", 1)
-    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --elites 5")
+    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
     learner.real.rows[:, 0] = -1.0
     learner.env.task.terminated = lambda obs: obs[:, 0] > 2.5
     monkeypatch.setattr(learner.models, "predict", lambda obs, action: (torch.ones(250, 1), action[:, 0]))
@@ -193,9 +192,10 @@ def test_enhanced_steps_are_those_of_the_simulator_to_second_order(env: str) -> 
     assert ratios.median().item() == pytest.approx(4, rel=0.1), ratios
 
 
-def test_enhanced_transitions_are_observed_and_rewarded_as_the_task_does() -> None:
+def test_enhanced_transitions_are_observed_and_rewarded_as_the_task_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """At no distance they are the real ones, the observed last action included; at some, near them."""
-    learner = build("--sample-enhance", "2", "--enhance-scale", "1e-9")
+    monkeypatch.setattr(mbpo, "ENHANCE_SCALE", 1e-9)
+    learner = build("--sample-enhance", "2")
     env = learner.env
     for _ in range(2):
         learner.explore()
@@ -209,7 +209,8 @@ def test_enhanced_transitions_are_observed_and_rewarded_as_the_task_does() -> No
     torch.manual_seed(0)
     state = torch.cat((env.qpos, env.qvel), 1)[1:].clone()
     obs, action = env.detach()[1:], torch.rand(3, 8)
-    learner.args.enhance_scale, learner.args.sample_enhance = 0.1, 50
+    learner.args.sample_enhance = 50
+    monkeypatch.setattr(mbpo, "ENHANCE_SCALE", 0.1)
     near = mbpo.enhance(learner, state, Transition(obs, action, *[torch.zeros(3)] * 3))
     spread = near.action.view(50, 3, 8).atanh() - action.atanh()
     assert spread.std().item() == pytest.approx(0.1, rel=0.1)

@@ -33,11 +33,10 @@ from tyro.conf import Positional
 
 from diffsim import TASKS, Scene
 from diffsim.extra.commands import DEMO_EPISODES, POLICIES
-from diffsim.extra.gait import TOUCHING
+from diffsim.extra.gait import TOUCHING, contact_bodies, trace
 from diffsim.extra.render import Frame, Renderer, whole_file
 from diffsim.extra.robots.imitation.tracking import Tracking
 from diffsim.extra.robots.joystick import Joystick
-from diffsim.robot.contact import contact_bodies, trace
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import distributions, version
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated
 
 import torch
 import tyro
@@ -32,8 +32,7 @@ from diffsim.training.checkpoint import POLICIES
 from diffsim.training.errors import in_one_line
 
 PACKAGE = Path(str(files("diffsim")))
-Learner = Literal["shac", "sapo", "bptt", "pods", "ppo_baseline", "sac_baseline", "mbpo", "pfpn", "pfpn_sac", "gps"]
-LEARNERS = get_args(Learner)
+LEARNER = "\nmain = script("  # a script that has this line is one
 DEMO_EPISODES = 8  # the one of median return is filmed
 DEMO_SECONDS = 4.0  # of it
 
@@ -62,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _later(function: Callable[..., object]) -> Callable[..., Callable[[], object]]:
-    """Of the same signature: the call, to be made."""
+    """Return a function of the same signature that returns the call, to be made."""
     return functools.wraps(function)(lambda *args, **kwargs: functools.partial(function, *args, **kwargs))
 
 
@@ -120,12 +119,21 @@ def drive(
         serve(make_policy_env(saved, 1, forces=True, env=own), saved.network, str(saved), host, port)
 
 
-def train(learner: Positional[Learner]) -> None:
+def train(learner: Annotated[Positional[str], tyro.conf.arg(metavar=f"{{{','.join(find_learners())}}}")]) -> None:
     """Train a policy, e.g. diffsim train shac --env ant; `diffsim train shac --help` lists the learner's flags.
 
     Args:
         learner: the algorithm.
     """
+
+
+def scripts() -> Path:
+    """Return the folder of the scripts: the wheel has them in the package, a clone next to it."""
+    return inside if (inside := PACKAGE / "learners").is_dir() else PACKAGE.parent
+
+
+def find_learners() -> list[str]:
+    return sorted(path.stem for path in scripts().glob("*.py") if LEARNER in path.read_text(errors="ignore"))
 
 
 def view() -> None:
@@ -170,12 +178,11 @@ def export(checkpoint: Positional[Path], output: Positional[Path], env: str | No
 
 
 def run_script(name: str, flags: Sequence[str]) -> None:
-    """A script of the repository: the wheel has them in the package, a clone next to it."""
-    if name not in (*LEARNERS, "view"):
-        fail(f"unknown learner {name!r}: choose from {', '.join(LEARNERS)}")
-    inside = PACKAGE / "learners"
+    """Run a script of the repository."""
+    if name not in (*(learners := find_learners()), "view"):
+        fail(f"unknown learner {name!r}: choose from {', '.join(learners)}")
     sys.argv[1:] = flags
-    runpy.run_path(str((inside if inside.is_dir() else PACKAGE.parent) / f"{name}.py"), run_name="__main__")
+    runpy.run_path(str(scripts() / f"{name}.py"), run_name="__main__")
 
 
 # The report -----------------------------------------------------------------------------------------------------------
@@ -209,7 +216,7 @@ def describe_machine() -> dict[str, str]:
 
 
 def find_gpu_troubles() -> list[str]:
-    """What to look at on a machine that has a driver where torch or Warp sees no GPU."""
+    """Say what to look at on a machine that has a driver where torch or Warp sees no GPU."""
     sees = {"torch": torch.cuda.is_available(), "Warp": wp.is_cuda_available()}
     if all(sees.values()) or not (startup.nvidia_driver() or shutil.which("nvidia-smi")):
         return []

@@ -1,4 +1,4 @@
-"""How a robot moves over the ground, as numbers of each foot, and of the robot with its actions."""
+"""Measure how a robot moves over the ground, as numbers of each foot, and of the robot with its actions."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import contact_bodies, trace
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Array, Index, Scene
 from diffsim.training.directory import say
 from diffsim.training.evaluation import Evaluation
 
@@ -48,6 +47,27 @@ def lines(gait: Gait) -> list[str]:
     return [f"{part:16}  {text}" for part, text in zip(gait, texts, strict=True)]
 
 
+def contact_bodies(scene: Scene) -> Index:
+    """Return MuJoCo's number of the body (ncontact,) of each contact sphere."""
+    return scene.mj_model.dof_bodyid[scene.contact_link + (5 if scene.floating else -1)]  # a link's last dof
+
+
+def trace(scene: Scene, qpos: Array) -> tuple[Array, Array]:
+    """Compute depth (F, nc) and slip (F - 1, nc) [m] of the contact spheres' lowest points for qpos (F, nq)."""
+    model, data, bodies = scene.mj_model, mujoco.MjData(scene.mj_model), contact_bodies(scene)
+    # A link's frame has the axes of its body and sits at the anchor of its joint.
+    centre = model.jnt_pos[model.body_jntadr[bodies] + model.body_jntnum[bodies] - 1] + scene.contact_position
+    place, turn = np.empty((len(qpos), len(bodies), 3)), np.empty((len(qpos), len(bodies), 3, 3))
+    for k, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        place[k], turn[k] = data.xpos[bodies], data.xmat[bodies].reshape(-1, 3, 3)
+    lowest = centre - scene.contact_radius[:, None] * turn[:, :, 2]  # in the body's frame
+    point = place + np.einsum("fcij,fcj->fci", turn, lowest)
+    moved = place[1:] + np.einsum("fcij,fcj->fci", turn[1:], lowest[:-1]) - point[:-1]
+    return scene.ground_height - point[..., 2], np.linalg.norm(moved[..., :2], axis=-1)
+
+
 def work(scene: Scene, dt: float, qpos: Array, action: Array) -> float:
     """J that the motors do, without what they absorb, over the robot's weight: m."""
     model, data, done = scene.mj_model, mujoco.MjData(scene.mj_model), 0.0
@@ -61,7 +81,7 @@ def work(scene: Scene, dt: float, qpos: Array, action: Array) -> float:
 
 
 def measure(scene: Scene, dt: float, episodes: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> Gait:
-    """Of episodes qpos (F, nq) and action (F, nu); empty without contact with a plane or if all are short."""
+    """Measure episodes of qpos (F, nq) and action (F, nu); empty without contact with a plane or if all are short."""
     first, feet = round(SETTLING / dt), Gait()
     settled = [(q[first:], a[first:]) for q, a in islice(episodes, EPISODES) if len(q) > first + 1]
     if "contact" not in scene.features or scene.terrain is not None or not settled:

@@ -38,13 +38,13 @@ class Reflection:
 
     @staticmethod
     def of(numbers: Iterable[tuple[int, float]], device: torch.device, dtype: torch.dtype) -> Reflection:
-        """Of numbers that come each from a place and with a sign."""
+        """Make the reflection of numbers that come each from a place and with a sign."""
         index, sign = zip(*numbers, strict=True)
         return Reflection(torch.tensor(index, device=device), torch.tensor(sign, device=device, dtype=dtype))
 
     @staticmethod
     def cat(parts: Sequence[Reflection]) -> Reflection:
-        """Of numbers that stand one after the other."""
+        """Make the reflection of numbers that stand one after the other."""
         index, start = [], 0
         for part in parts:
             index.append(part.index + start)
@@ -62,12 +62,12 @@ class Mirror(NamedTuple):
 
     @property
     def size(self) -> Reflection:
-        """Of numbers that each action has and that have no direction, such as standard deviations."""
+        """Reflect numbers that each action has and that have no direction, such as standard deviations."""
         return Reflection(self.action.index, torch.ones_like(self.action.sign))
 
     @property
     def value(self) -> Reflection:
-        """Of one number that is the same in the image."""
+        """Reflect one number that is the same in the image."""
         return Reflection.of([(0, 1.0)], self.obs.sign.device, self.obs.sign.dtype)
 
 
@@ -107,7 +107,7 @@ def reflections(
 
 
 def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Sequence[float], Sequence[float]]:
-    """Of the positions and of the rates of a joint."""
+    """Return the signs of the positions and of the rates of a joint."""
     kind = model.jnt_type[joint]
     if kind == mujoco.mjtJoint.mjJNT_FREE:
         return (*VECTOR, *QUATERNION), (*VECTOR, *PSEUDOVECTOR)
@@ -121,7 +121,7 @@ def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Seque
 
 
 def partners(names: Sequence[str], sides: Sides) -> list[int]:
-    """Where the other side's name of each is; its own place if it is of no side."""
+    """Find the place of the other side's name of each; its own place if it is of no side."""
     other = {side: pair[1 - k] for pair in sides for k, side in enumerate(pair)}
     ends = "|".join(other)
     images = [re.sub(f"^({ends})|({ends})$", lambda side: other[side[0]], name, count=1) for name in names]

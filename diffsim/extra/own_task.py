@@ -1,18 +1,25 @@
-"""Tasks of a user's own: a class in a file."""
+"""Tasks of a user's own: a class in a file, and its mistakes in one line each."""
 
 from __future__ import annotations
 
 import functools
 import importlib.util
-import re
+import math
 import sys
 import traceback
+from difflib import get_close_matches
+from numbers import Integral
 from pathlib import Path
 from types import ModuleType
 
-from diffsim.tasks.base import Task, TaskError
+import torch
+from torch import Tensor
 
-FILE = re.compile(r"(.+\.py)(?::(\w+))?")  # my_task.py or my_task.py:Class
+from diffsim.robot.scene import Scene
+from diffsim.sim.integration import is_real
+from diffsim.tasks import FILE, Task, TaskError
+
+LIKENESS = 0.9  # difflib ratio above which a name counts as misspelt
 
 
 def task_of_file(name: str) -> type[Task]:
@@ -50,3 +57,73 @@ def _module(path: Path, _changed: int) -> ModuleType:
     finally:
         sys.path.remove(str(path.parent))
     return module
+
+
+# Checks, which Task.bind asks for ------------------------------------------------------------------------------------
+
+
+def check_attributes(task: Task, nq: int) -> None:
+    """Raise TaskError for a missing method, a misspelt name, or an attribute that would fail during a run."""
+    own = {name for kind in type(task).__mro__ if not kind.__module__.startswith("diffsim.") for name in vars(kind)}
+    known = {name for name in (*vars(Task), *Task.__annotations__) if not name.startswith("_")}
+    for name in sorted(own - known):
+        if meant := get_close_matches(name, known - own, 1, LIKENESS):
+            raise TaskError(f"task {task.name!r} has {name!r}: is {meant[0]!r} meant?")
+    if "ground" in own:
+        raise TaskError(f"task {task.name!r} has 'ground', which is the terrain: give it another name")
+    for names in (("observe", "observe_with"), ("reward",)):
+        if all(getattr(type(task), name) is getattr(Task, name) for name in names):
+            raise TaskError(f"task {task.name!r} has no method {names[0]!r}")
+    name, length, height, column = task.name, task.episode_length, task.min_height, task.forward_column
+    whole, numbered = (isinstance(value, Integral) and is_real(value) for value in (length, column))
+    found = column is None or (numbered and column in range(nq))
+    named = isinstance(name, str) and name == Path(name).name and name not in ("", "..")
+    for attribute, fits, allowed in (
+        ("name", named, "the name of a folder, without a slash"),
+        ("episode_length", whole and length >= 1, "an integer of at least 1"),
+        ("min_height", height is None or (is_real(height) and height > -math.inf), "a number of meters, or None"),
+        ("forward_column", found, f"a column of qpos, 0 to {nq - 1}, or None"),
+    ):
+        if not fits:
+            raise TaskError(f"task {name!r}: {attribute} is {getattr(task, attribute)!r}, must be {allowed}")
+
+
+def check_methods(task: Task, scene: Scene) -> None:
+    """Raise TaskError where what a method returns for two starts does not fit, or an episode is over there."""
+
+    def check(name: str, value: object, expected: object, source: str = "") -> None:
+        if value != expected:
+            raise TaskError(f"task {task.name!r}: {name} is {value}, must be {expected}{source and f' ({source})'}")
+
+    def tensor(method: str, value: Tensor) -> Tensor:
+        if not isinstance(value, Tensor):
+            raise TaskError(f"task {task.name!r}: {method} returns {type(value).__name__}, must return a torch tensor")
+        if not value.isfinite().all():
+            raise TaskError(f"task {task.name!r}: what {method} returns for the start is not finite")
+        return value
+
+    n, start, spread = scene.nq + scene.nv, task._start, task._spread
+    if type(task).reset is Task.reset:
+        check("num_random", task.num_random, n, "nq + nv")
+        check("the length of start", len(start), n, "nq + nv")
+        check("the length of spread", len(spread) if spread.ndim else n, n, "nq + nv")
+    rand = torch.full((2, task.num_random), 0.5, device=task.device, dtype=task.dtype)
+    qpos, qvel = task.reset(rand)
+    check("the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
+    action, memory = rand.new_zeros(2, scene.nu), task.begin(rand)
+    check("the width of what begin returns", memory.shape[-1], task.num_memory, "num_memory")
+    obs = tensor("observe", task.observe_with(qpos, qvel, action, memory))
+    check("the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
+    check("obs_dim", getattr(task, "obs_dim", obs.shape[-1]), obs.shape[-1], "what observe returns")
+    if task.obs_parts:
+        check("the sum of obs_parts", sum(size for _, size in task.obs_parts), obs.shape[-1], "obs_dim")
+    reward = tensor("reward", task.reward(obs, action))
+    check("the shape of two rewards", tuple(reward.shape), (2,))
+    for k in scene.quaternion_adr:
+        if not qpos[:, k : k + 4].any(1).all():
+            raise TaskError(f"task {task.name!r}: the quaternion qpos[{k}:{k + 4}] of the start is zero")
+    over = tensor("terminated", task.terminated(obs))
+    check("what terminated returns for two observations", (over.dtype, tuple(over.shape)), (torch.bool, (2,)))
+    if over.any():
+        bound = "" if task.min_height is None else f", and min_height is {task.min_height}"
+        raise TaskError(f"task {task.name!r}: an episode ends where it starts; obs[0] is {obs[0, 0]:.4g}{bound}")

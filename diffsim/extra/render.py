@@ -148,7 +148,7 @@ def activations(model: mujoco.MjModel, ctrl: ArrayLike) -> tuple[NDArray[np.intp
 
 
 def orbit(model: mujoco.MjModel) -> dict[str, Any]:
-    """Where the MJCF's first camera stands relative to what it follows, as the orbit about a point that it looks at.
+    """Compute the place of the MJCF's first camera relative to what it follows, as an orbit about what it looks at.
 
     Without one, or if the robot carries it, where the robot, in its start pose, fills half of the picture.
     """
@@ -279,7 +279,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @functools.cache
 def check_opengl() -> str:
-    """What draws pictures here, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"; raises RuntimeError with the remedy.
+    """Name what draws pictures here, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"; raises RuntimeError with the remedy.
 
     MUJOCO_GL chooses the OpenGL before MuJoCo is imported. Without it, on Linux, it is EGL, which needs no display.
     """

@@ -7,18 +7,20 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
+from diffsim.extra.gait import trace
 from diffsim.robot.contact import (
     HULL_POINTS,
     base_geoms,
+    collide,
     contact_points,
+    declared_pairs,
     ground_pairs,
     hull,
     pair_law,
-    self_pairs,
-    trace,
 )
-from diffsim.robot.elements import control_range, label, listed, motors
+from diffsim.robot.elements import control_range, disabled_flags, label, listed, motors
 from diffsim.robot.scene import Scene
 
 Kind, Geom, Integrator = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtIntegrator
@@ -66,6 +68,21 @@ def _parts(scene: Scene) -> Iterator[str]:
 def approximations(scene: Scene) -> tuple[str, ...]:
     """Return a sentence for each approximation."""
     return tuple(sentence for check in (_self_contact, _ground, _actuators, _options) for sentence in check(scene))
+
+
+def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Yield the robot's geoms, each with the later ones of other bodies that it may touch."""
+    weld = m.body_weldid[m.geom_bodyid]
+    parent = m.body_weldid[m.body_parentid[weld]]
+    filters = "filterparent" not in disabled_flags(m)
+    parts = np.flatnonzero((weld > 0) | base_geoms(m))
+    declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
+    for k, a in enumerate(parts.tolist()):
+        b = parts[k + 1 :]
+        related = ((parent[a] == weld[b]) | (parent[b] == weld[a])) & (weld[a] > 0) & (weld[b] > 0)
+        touch = (weld[a] != weld[b]) & ~(filters & related) & collide(m, a, b)
+        if len(b := b[touch | np.isin(b, [second for first, second in declared if first == a])]):
+            yield a, b
 
 
 def _self_contact(scene: Scene) -> Iterator[str]:

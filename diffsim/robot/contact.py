@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.elements import disabled_flags
-from diffsim.robot.scene import Array, Index, Scene
+from diffsim.robot.scene import Array
 
 HULL_POINTS = 16  # of a mesh, at most
 _CORNERS = np.array([[x, y, z] for y in (-1, 1) for x in (-1, 1) for z in (-1, 1)], float)
@@ -41,7 +40,7 @@ def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
     """List (fixed geom, moving geom) that may touch; geoms of the robot's own base are no ground."""
     weld = m.body_weldid[m.geom_bodyid]
     moving, ground = np.flatnonzero(weld), np.flatnonzero((weld == 0) & ~base_geoms(m))
-    pairs = {(s, g): None for s in ground.tolist() for g in moving[_collide(m, s, moving)].tolist()}
+    pairs = {(s, g): None for s in ground.tolist() for g in moving[collide(m, s, moving)].tolist()}
     sides = {(s, g): None for pair in declared_pairs(m) for s, g in (pair, pair[::-1]) if weld[g] and s in ground}
     return list(pairs | sides)
 
@@ -61,22 +60,8 @@ def declared_pairs(m: mujoco.MjModel) -> dict[tuple[int, int], int]:
     return {(a, b): k for k, (a, b) in enumerate(ends)}
 
 
-def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield the robot's geoms, each with the later ones of other bodies that it may touch."""
-    weld = m.body_weldid[m.geom_bodyid]
-    parent = m.body_weldid[m.body_parentid[weld]]
-    filters = "filterparent" not in disabled_flags(m)
-    parts = np.flatnonzero((weld > 0) | base_geoms(m))
-    declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
-    for k, a in enumerate(parts.tolist()):
-        b = parts[k + 1 :]
-        related = ((parent[a] == weld[b]) | (parent[b] == weld[a])) & (weld[a] > 0) & (weld[b] > 0)
-        touch = (weld[a] != weld[b]) & ~(filters & related) & _collide(m, a, b)
-        if len(b := b[touch | np.isin(b, [second for first, second in declared if first == a])]):
-            yield a, b
-
-
-def _collide(m: mujoco.MjModel, a: int, b: NDArray[np.int64]) -> NDArray[np.bool_]:
+def collide(m: mujoco.MjModel, a: int, b: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which geoms b the masks and exclusions of the file let touch geom a."""
     masks = (m.geom_contype[a] & m.geom_conaffinity[b]) | (m.geom_contype[b] & m.geom_conaffinity[a])
     bodies = m.geom_bodyid[a], m.geom_bodyid[b]
     excluded = np.isin((np.minimum(*bodies) << 16) + np.maximum(*bodies), m.exclude_signature)
@@ -148,24 +133,3 @@ def _spread(points: Array) -> Array:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return points[chosen]
-
-
-def contact_bodies(scene: Scene) -> Index:
-    """Return MuJoCo's number of the body (ncontact,) of each contact sphere."""
-    return scene.mj_model.dof_bodyid[scene.contact_link + (5 if scene.floating else -1)]  # a link's last dof
-
-
-def trace(scene: Scene, qpos: Array) -> tuple[Array, Array]:
-    """Compute depth (F, nc) and slip (F - 1, nc) [m] of the contact spheres' lowest points for qpos (F, nq)."""
-    model, data, bodies = scene.mj_model, mujoco.MjData(scene.mj_model), contact_bodies(scene)
-    # A link's frame has the axes of its body and sits at the anchor of its joint.
-    centre = model.jnt_pos[model.body_jntadr[bodies] + model.body_jntnum[bodies] - 1] + scene.contact_position
-    place, turn = np.empty((len(qpos), len(bodies), 3)), np.empty((len(qpos), len(bodies), 3, 3))
-    for k, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        place[k], turn[k] = data.xpos[bodies], data.xmat[bodies].reshape(-1, 3, 3)
-    lowest = centre - scene.contact_radius[:, None] * turn[:, :, 2]  # in the body's frame
-    point = place + np.einsum("fcij,fcj->fci", turn, lowest)
-    moved = place[1:] + np.einsum("fcij,fcj->fci", turn[1:], lowest[:-1]) - point[:-1]
-    return scene.ground_height - point[..., 2], np.linalg.norm(moved[..., :2], axis=-1)

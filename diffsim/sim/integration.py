@@ -1,4 +1,4 @@
-"""How a control step is integrated: the contact model, the number of its substeps and how they are taken."""
+"""Integration of a control step: the contact model, the number of its substeps and how they are taken."""
 
 from __future__ import annotations
 

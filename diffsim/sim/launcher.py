@@ -47,10 +47,12 @@ class Launcher:
     def __init__(self, scene: Scene, num_envs: int, options: Options) -> None:
         self.scene, self.num_envs = scene, num_envs
         self.device, self.dtype = torch.device(options.device), options.dtype
-        real, cuda, division = WARP_DTYPE[self.dtype], self.device.type == "cuda", options.division
-        if division is None:
+        real, cuda, asked = WARP_DTYPE[self.dtype], self.device.type == "cuda", options.division
+        if asked is None:
             division = default_division(scene, num_envs) if cuda else divide(scene)
-        elif division.threads_per_env > 1 and not cuda:
+        else:  # of this scene: contact models have contact spheres of their own
+            division = divide(scene, *asked)
+        if division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         block = options.block or default_block(num_envs, options)
         how = options.integration

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from diffsim.kernels.lanes import Division
 from diffsim.sim.integration import Integration, check_count
 
 WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -25,7 +24,8 @@ class Options(NamedTuple):
         factors: let constants of the scene differ between environments: Simulator.factors.
         forces: let external forces act on the bodies: Simulator.forces.
         block: environments that a CPU thread steps at once in vectors of float32, 1, 8 or 16; default the fastest.
-        division: how GPU threads share an environment, from kernels.lanes.divide; default the fastest as measured.
+        division: (threads_per_env, sharers) of kernels.lanes.divide, how GPU threads share an environment; default the
+            fastest as measured.
     """
 
     integration: Integration = Integration()
@@ -35,7 +35,7 @@ class Options(NamedTuple):
     factors: bool = False
     forces: bool = False
     block: int | None = None
-    division: Division | None = None
+    division: tuple[int, int] | None = None
 
     def check(self) -> Options:
         """Return itself with plain types; raises ValueError, with what is allowed, for an invalid field."""

@@ -7,13 +7,10 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 
 from __future__ import annotations
 
-import math
 import os
 import pkgutil
 import sys
-from difflib import get_close_matches
 from functools import cached_property
-from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
@@ -26,13 +23,13 @@ from torch import Tensor
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
 from diffsim.sim.elevation import Elevation
-from diffsim.sim.integration import TOLERANCE, Contact, Integration, check_contact, is_real
+from diffsim.sim.integration import TOLERANCE, Contact, Integration, check_contact
 
 Accuracy = Literal["fast", "default", "accurate"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
 OPTIONS = "diffsim.extra.variation:configure"  # reads options after a task's name
-LIKENESS = 0.9  # difflib ratio above which a name counts as misspelt
+OWN_TASK = "diffsim.extra.own_task"  # checks tasks outside this package
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
@@ -104,12 +101,13 @@ class Task:
         """Fit the task to its robot and return it: find missing start, num_random, obs_dim and forward_column.
 
         Raises:
-            TaskError: a name, a number or what a method returns does not fit; an episode is over where it starts.
+            TaskError: of a task outside this package, see extra/own_task.py.
         """
-        self._check_names()
-        n, m = scene.nq + scene.nv, scene.mj_model
+        own = None if type(self).__module__.startswith("diffsim.") else pkgutil.resolve_name(OWN_TASK)
         self.forward_column = getattr(self, "forward_column", way_forward(scene))
-        self._check_attributes(scene.nq)
+        if own is not None:
+            own.check_attributes(self, scene.nq)
+        n, m = scene.nq + scene.nv, scene.mj_model
         self.num_random = getattr(self, "num_random", n)
         if type(self).reset is Task.reset:
             self._nq, self._quaternions = scene.nq, scene.quaternion_adr.tolist()
@@ -117,71 +115,13 @@ class Task:
                 key = max(mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
                 home = self._start.new_tensor(m.key_qpos[key] if m.nkey else scene.qpos0)
                 self._start = torch.cat((home, self._start.new_zeros(scene.nv)))
-            sizes = {"num_random": self.num_random, "the length of start": len(self._start)}
-            for name, size in (sizes | {"the length of spread": len(self._spread) if self._spread.ndim else n}).items():
-                self._check(name, size, n, "nq + nv")
-        rand = self._start.new_full((2, self.num_random), 0.5)
-        qpos, qvel, action = state = *self.reset(rand), self._start.new_zeros(2, scene.nu)
-        self._check("the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
-        memory = self.begin(rand)
-        self._check("the width of what begin returns", memory.shape[-1], self.num_memory, "num_memory")
-        obs = self._tensor("observe", self.observe_with(*state, memory))
-        self._check("the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
-        self.obs_dim = getattr(self, "obs_dim", obs.shape[-1])
-        self._check("obs_dim", self.obs_dim, obs.shape[-1], "what observe returns")
-        if self.obs_parts:
-            self._check("the sum of obs_parts", sum(size for _, size in self.obs_parts), self.obs_dim, "obs_dim")
-        reward = self._tensor("reward", self.reward(obs, action))
-        self._check("the shape of two rewards", tuple(reward.shape), (2,))
-        for k in scene.quaternion_adr:
-            if not qpos[:, k : k + 4].any(1).all():
-                raise TaskError(f"task {self.name!r}: the quaternion qpos[{k}:{k + 4}] of the start is zero")
-        over = self._tensor("terminated", self.terminated(obs))
-        self._check("what terminated returns for two observations", (over.dtype, tuple(over.shape)), (torch.bool, (2,)))
-        if over.any():
-            bound = "" if self.min_height is None else f", and min_height is {self.min_height}"
-            raise TaskError(f"task {self.name!r}: an episode ends where it starts; obs[0] is {obs[0, 0]:.4g}{bound}")
+        if own is not None:
+            own.check_methods(self, scene)
+        if not hasattr(self, "obs_dim"):
+            rand = self._start.new_full((1, self.num_random), 0.5)
+            obs = self.observe_with(*self.reset(rand), self._start.new_zeros(1, scene.nu), self.begin(rand))
+            self.obs_dim = obs.shape[-1]
         return self
-
-    def _tensor(self, method: str, value: Tensor) -> Tensor:
-        """Return a method's result for the start; raises TaskError unless it is a finite tensor."""
-        if not isinstance(value, Tensor):
-            raise TaskError(f"task {self.name!r}: {method} returns {type(value).__name__}, must return a torch tensor")
-        if not value.isfinite().all():
-            raise TaskError(f"task {self.name!r}: what {method} returns for the start is not finite")
-        return value
-
-    def _check(self, name: str, value: object, expected: object, source: str = "") -> None:
-        if value != expected:
-            raise TaskError(f"task {self.name!r}: {name} is {value}, must be {expected}{source and f' ({source})'}")
-
-    def _check_names(self) -> None:
-        """Check that a class outside this package has the required methods, and none of Task's names misspelt."""
-        own = {name for kind in type(self).__mro__ if not kind.__module__.startswith("diffsim.") for name in vars(kind)}
-        known = {name for name in (*vars(Task), *Task.__annotations__) if not name.startswith("_")}
-        for name in sorted(own - known):
-            if meant := get_close_matches(name, known - own, 1, LIKENESS):
-                raise TaskError(f"task {self.name!r} has {name!r}: is {meant[0]!r} meant?")
-        if "ground" in own:
-            raise TaskError(f"task {self.name!r} has 'ground', which is the terrain: give it another name")
-        for names in (("observe", "observe_with"), ("reward",)):
-            if all(getattr(type(self), name) is getattr(Task, name) for name in names):
-                raise TaskError(f"task {self.name!r} has no method {names[0]!r}")
-
-    def _check_attributes(self, nq: int) -> None:
-        """Check attributes that would otherwise fail during a run."""
-        name, length, height, column = self.name, self.episode_length, self.min_height, self.forward_column
-        whole, numbered = (isinstance(value, Integral) and is_real(value) for value in (length, column))
-        found = column is None or (numbered and column in range(nq))
-        named = isinstance(name, str) and name == Path(name).name and name not in ("", "..")
-        for attribute, fits, allowed in (
-            ("name", named, "the name of a folder, without a slash"),
-            ("episode_length", whole and length >= 1, "an integer of at least 1"),
-            ("min_height", height is None or (is_real(height) and height > -math.inf), "a number of meters, or None"),
-            ("forward_column", found, f"a column of qpos, 0 to {nq - 1}, or None"),
-        ):
-            if not fits:
-                raise TaskError(f"task {name!r}: {attribute} is {getattr(self, attribute)!r}, must be {allowed}")
 
     @classmethod
     def presets(cls, contact: str | None = None) -> dict[str, Integration]:

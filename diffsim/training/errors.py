@@ -21,7 +21,7 @@ from diffsim.tasks import TaskError
 
 
 class UsageError(ValueError):
-    """What a user asked for cannot be done. The message is one line: what is wrong, and what is allowed."""
+    """Raised for what cannot be done, with a message of one line: what is wrong, and what is allowed."""
 
 
 # Errors whose message says all that a user needs.

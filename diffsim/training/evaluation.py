@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ FILM = "diffsim.extra.render:film"
 GAIT = "diffsim.extra.gait:report"
 VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
-FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit; 0: not checked
+FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit
 ENOUGH = 0.97  # share of the return that must survive
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
@@ -40,6 +40,8 @@ SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 @dataclass
 class Evaluation:
     """One episode each of n environments."""
+
+    compared: ClassVar[bool] = True  # at a run's end and with --evaluate, with one at FINER times the substeps
 
     returns: Tensor  # (n,) undiscounted
     lengths: Tensor  # (n,) control steps
@@ -248,7 +250,7 @@ def compare_finer(args: Args, evaluation: Evaluation, measure: Callable[[Args], 
     Returns:
         for evaluation.json: the finer substeps, the return there and the share that is kept.
     """
-    if not FINER:
+    if not evaluation.compared:
         return {}
     substeps = FINER * args.substeps
     value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()

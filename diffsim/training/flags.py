@@ -74,7 +74,7 @@ class Flags:
 
     def task_defaults(self) -> dict[str, Any]:
         """Return defaults that depend on other flags, such as the task, the device or the preset."""
-        return {}
+        return {"symmetric": find_task(self.env).symmetric} if hasattr(self, "symmetric") else {}
 
     def check(self) -> None:
         """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from diffsim.env import ActionError, DiffEnv
 from diffsim.sim.options import check_device
-from diffsim.tasks import find_task
+from diffsim.tasks import FILE, find_task
 from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
 from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, make_unused, say
@@ -156,7 +156,7 @@ class Run:
         if state := self._state:
             own = state["ranks"][rank]
             episodes = (self._env, own["env"]) if self._env is not None else None
-            if state["args"]["env"] != self.args.env:
+            if state["args"]["env"] != self.args.env and not FILE.fullmatch(self.args.env):
                 episodes = None  # which stand on another clip's frames or on other ground: new ones begin
             checkpoint.restore(learner, state, episodes)
             self._random_numbers().set_state(own["rng"])

@@ -44,30 +44,3 @@ def test_another_clip_leaves_the_servos_their_range(tmp_path: Path) -> None:
     np.savez(file := tmp_path / "beginning.npz", qpos=karate, fps=60, loop=False)
     (row,) = tracking.measure(tracking.Args(clip=file, episodes=2, friction=(1.0,)), POLICIES / "g1_track.pt")
     assert row["success"] == 1 and row["joint error"] < 0.05
-
-
-def test_tables_of_policies_variants_and_races() -> None:
-    row = {"clip": "walk", "motions": "1", "seed": "1", "checkpoint": "h100/1", "push": "0", "success": "1"}
-    row |= {"learner": "sapo randomised", "device": "cuda", "training s": "100"}
-    row |= {"joint error": "0.06", "root error": "0.04"}
-    rows = [row | {"friction": f, "success": s} for f, s in (("0.7", "0.5"), ("1", "0.9"))]
-    shared = row | {"checkpoint": "h100_shared/2", "friction": "1", "training s": "300"}
-    several = row | {"checkpoint": "h100/all", "friction": "1", "motions": "44", "whole motions": "40"}
-    (line,) = tracking.table([*rows, shared, several])
-    assert (line["policy"], line["seeds"], line["training (s)"]) == ("walk", 2, "100")
-    assert (line["success"], line["pushed"]) == ("95% (50%)", "")
-    (line,) = tracking.many([*rows, several, several | {"friction": "1.3"}])
-    assert (line["motions"], line["motions with 95%"]) == ("44", "40")
-    way = [
-        row
-        | {"checkpoint": f"sapo__1/at_{k}", "iteration": str(k), "control steps": f"{k}e5"}
-        | {"training s": str(k + 10), "success": share}
-        for k, share in ((90, "1"), (20, "0.5"), (40, "0.95"), (60, "0.94"), (80, "0.96"))
-    ]
-    never = way[1] | {"checkpoint": "ppo_in_mujoco_warp__1/at_20", "success": "0.1"}
-    shared = way[2] | {"checkpoint": "window_8__1_shared/at_40"}
-    sapo, ppo = tracking.race([*way, never, shared])
-    assert list(sapo.values())[:5] == ["sapo", "0.06", "4", "50", "90"]
-    assert (ppo["training"], ppo["s to 95%"], ppo["last success"]) == ("ppo in mujoco warp", "never", "10%")
-    (window,) = tracking.race([*way, never, shared], shared=True)
-    assert window == {"training": "window 8", "M steps": "4", "last success": "95%"}

@@ -30,9 +30,9 @@ def chain(monkeypatch):
     return make
 
 
-def link(parent: str, revision: str, differ: str = "", reason: str = "", sentinels: str = "") -> dict[str, str]:
+def link(parent: str, revision: str, differ: str = "", reason: str = "") -> dict[str, str]:
     equal = " ".join(name for name in NAMES if name not in differ.split())
-    values = revision, parent, "cpu", equal, differ, reason, sentinels
+    values = revision, parent, "cpu", equal, differ, reason
     return dict(zip(fingerprints.COLUMNS, values, strict=True))
 
 
@@ -58,13 +58,6 @@ def test_a_result_counts_while_each_link_keeps_what_it_depends_on(chain):
     made[1] = link("b", "c", differ="ant")
     assert [counts(revision, "shac --env ant") for revision in "abxcd"] == [False, False, False, True, True]
     assert counts("a", "shac --env humanoid")
-    for told, kept in (
-        ("", False),
-        ("shac --env ant within: 5 in 4 to 6; sapo --env ant beyond: 3 in 4 to 6", False),
-        ("shac --env ant within: 5 in 4 to 6; sapo --env hopper beyond: 3 in 4 to 6", True),
-    ):
-        made[1] = link("b", "c", differ="ant", reason="a better ant", sentinels=told)
-        assert counts("a", "shac --env ant") == kept
     made[1] = link("b", "c") | {"equal": "shac"}  # the ant was not compared
     assert not counts("a", "shac --env ant") and counts("a", "shac --env hopper")
     made[1] = link("z", "c")  # nobody has compared b with z
@@ -127,30 +120,6 @@ def test_a_link_is_recorded_where_the_chain_ends_and_with_its_reason(chain, monk
     assert len(written) == 1
     fingerprints.record(args, "d", "a better ant")
     assert (written[-1]["differ"], written[-1]["reason"]) == ("ant", "a better ant")
-
-
-def test_a_sentinel_beyond_the_published_range_breaks_the_chain(chain, monkeypatch):
-    made, returns, written = chain(HEAD="d"), {"ant": 5.0, "humanoid": 5.0}, list[dict[str, str]]()
-    made[-1] |= {"equal": "shac", "differ": "ant humanoid", "reason": "a better ant"}
-    steps = {"ant": "9", "humanoid": "8", "hopper": "1"}
-    rows = [
-        {"learner": "shac", "task": task, "return": value, "control steps": steps[task]}
-        for task in steps
-        for value in ("4", "6")
-    ]
-    monkeypatch.setattr(paper, "read_csv", lambda path: rows)
-    monkeypatch.setattr("cells.begin", lambda *_: {})
-    monkeypatch.setattr(paper, "evaluation", lambda folder: {"return": returns[folder.name.partition("__")[0]]})
-    monkeypatch.setattr("tables.replace_csv", lambda path, rows, *_: written.extend(rows))
-    monkeypatch.setattr("cells.Runner.train", lambda *_: True)
-    monkeypatch.setattr("cells.Runner.evaluate", lambda *_: True)
-    args = paper.Args(update_results=True, machine="cpu")
-    assert paper.sentinels(args, {"ant", "humanoid"}) == [("shac", "humanoid"), ("shac", "ant")]
-    for value, kept in ((5.0, True), (7.0, False), (3.0, False)):
-        returns["ant"] = value
-        paper.measure_sentinels(args, paper.Runner(args))
-        made[-1] = written[-1]
-        assert counts("a", "shac --env ant") == kept and counts("a", "shac --env humanoid")
 
 
 def test_fingerprints_notice_changed_numbers_and_no_changed_words(tmp_path):

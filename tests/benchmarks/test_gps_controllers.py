@@ -69,21 +69,6 @@ def test_terrains_are_ten_places_and_four_seeds() -> None:
         assert len({named_terrains(name).tobytes() for names in found.values() for name in names}) == 14
 
 
-def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
-    shares = {"rough": (1.0, 0.0, 0.5), "incline": (0.5, 0.25, 1.0)}
-    rows = [
-        dict(env="walker", variant=case, seed=str(seed), kind=kind, terrain=kind, controller=name, walked=str(share))
-        for case, own in shares.items()
-        for kind in ("a", "b")
-        for name, share in zip(controllers.CONTROLLERS, own, strict=True)
-        for seed in (1, 2)
-    ]
-    rows += [rows[0] | {"seed": "3", "walked": "0.4"}]
-    first, second = controllers.table(rows)
-    assert first == {"over": "a", "rough": "80% / 0% / 50%", "incline": "50% / 25% / 100%"}
-    assert second["rough"] == "100% / 0% / 50%"
-
-
 def test_growth_is_the_largest_exponent() -> None:
     loop = torch.tensor([[1.1, 0.3], [0.0, 0.5]]).double().expand(4000, 2, 2)
     assert controllers.growth(loop, 0.02) == pytest.approx(math.log(1.1) / 0.02, rel=1e-2)

@@ -16,7 +16,7 @@ import tables
 from cells import Runner
 from learners import refusal
 
-LINK = dict(revision="HEAD", parent="HEAD", equal=" ".join(fingerprints.CASES), differ="", reason="", sentinels="")
+LINK = dict(revision="HEAD", parent="HEAD", equal=" ".join(fingerprints.CASES), differ="", reason="")
 SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4")
 
 

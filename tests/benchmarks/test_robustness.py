@@ -68,14 +68,6 @@ def resting() -> robustness.Walkers:
     return robustness.Walkers(env, idle, state)
 
 
-def test_a_push_gives_a_free_body_its_impulse() -> None:
-    force = torch.tensor([[3.0, 0.0, 0.0], [0.0, -5.0, 0.0], [1.0, 2.0, 3.0]])
-    states = [step.state for step in resting().walk(0.2, force)]
-    assert len(states) == 12
-    for k, state in enumerate(states, 1):
-        torch.testing.assert_close(state.qvel[:, :3], force * min(k, 6) / 60 / 2)
-
-
 def test_the_smallest_push_is_found() -> None:
     """The one that accelerates 2 kg to FAST in 0.1 s: 14 N; a share that never reaches a half has none."""
     walkers, pushes = resting(), list[float]()

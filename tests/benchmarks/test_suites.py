@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 
 import pytest
+import stages
 import suites
 from common import RESULTS, ROOT
 from gps_variants import VariantArgs
@@ -22,6 +23,7 @@ from diffsim.training import parse
 
 SCRIPTS = {
     "benchmarks/gps_variants": VariantArgs,
+    "benchmarks/stages": stages.Args,
     "mbpo": mbpo.Args,
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,

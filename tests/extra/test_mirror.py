@@ -66,12 +66,6 @@ def test_the_others_have_no_image() -> None:
         _ = TASKS["hopper"]().mirror
 
 
-@pytest.mark.parametrize("name", sorted(TASKS.keys() - set(MIRRORED)))
-def test_a_robot_in_a_plane_or_on_a_clip_has_no_mirror_image(name: str) -> None:
-    with pytest.raises(ValueError, match=f"task '{name}' has no mirror image"):
-        TASKS[name]().mirror  # noqa: B018
-
-
 @pytest.mark.parametrize(
     ("left", "axis", "message"),
     [("left_knee", "0 1 1", "axis of joint 'left_knee'"), ("other", "0 1 0", "there is no 'left_knee'")],

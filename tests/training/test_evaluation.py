@@ -117,13 +117,13 @@ def test_evaluate_a_checkpoint_with_other_substeps(
 ) -> None:
     """Returns of cartpole are costs, so the share that is kept is the inverse ratio."""
 
-    def found(folder: str, *flags: str, finer: int = 0) -> dict[str, Any]:
-        monkeypatch.setattr(evaluation, "FINER", finer)
+    def found(folder: str, *flags: str, compared: bool = False) -> dict[str, Any]:
+        monkeypatch.setattr(Evaluation, "compared", compared)
         path = tmp_path / "new" / folder
         shac.main(["--evaluate", str(tiny_run / "checkpoint.pt"), "--run-dir", str(path), *flags])
         return json.loads((path / "evaluation.json").read_text())
 
-    own = found("own", finer=4)
+    own = found("own", compared=True)
     finer, out = own.pop("finer"), capsys.readouterr().out
     assert own == json.loads((tiny_run / "evaluation.json").read_text()) and "gait" not in out
     assert own["speed"] is None and own["lengths"] == [240, 240]  # a robot without ground
@@ -140,7 +140,7 @@ def test_a_run_ends_with_the_return_at_finer_substeps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As --evaluate says it, unless the run is stopped early."""
-    monkeypatch.setattr(evaluation, "FINER", 4)
+    monkeypatch.setattr(Evaluation, "compared", True)
     flags = "--env cartpole --device cpu --num-envs 4 --horizon 4 --iterations 3 --eval-episodes 2 --quiet"
     run(shac, tmp_path, *flags.split(), stop_after=2)
     assert "retained" not in capsys.readouterr().out
@@ -148,5 +148,5 @@ def test_a_run_ends_with_the_return_at_finer_substeps(
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "retained" in line]
     written = json.loads((tmp_path / "evaluation.json").read_text())
     shac.main(["--evaluate", str(tmp_path)])
-    assert line in capsys.readouterr().out and line.startswith("semi_implicit with 16 substeps: return median ")
+    assert line in capsys.readouterr().out and line.startswith("16 substeps: return median ")
     assert json.loads((tmp_path / "evaluation.json").read_text()) == written and written["finer"]["substeps"] == 16

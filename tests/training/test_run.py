@@ -284,9 +284,9 @@ def test_a_file_that_is_named_from_another_directory_continues_its_episodes(tmp_
     text = "from diffsim.tasks.cartpole import CartPole\nclass Mine(CartPole):\n    name = 'mine'\n"
     (file := tmp_path / "mine.py").write_text(text)
     monkeypatch.chdir(tmp_path)
-    run(bptt, tmp_path / "run", *TINY, "--env", "mine.py", "--iterations", 2, "--stop-after", 1, "--quiet")
+    run(bptt, tmp_path / "run", *TINY, "--env", "mine.py", "--iterations", 2, "--quiet", stop_after=1)
     monkeypatch.chdir("/")
-    state = run(bptt, tmp_path / "run", "--resume", tmp_path / "run", "--env", file, "--stop-after", 2, "--quiet")
+    state = run(bptt, tmp_path / "run", "--resume", tmp_path / "run", "--env", file, "--quiet")
     assert (state["ranks"][0]["env"]["episode_step"] == 16).all()
 
 
@@ -356,7 +356,7 @@ def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = [*TINY, "--iterations", "2", "--quiet"]
     result = subprocess.run([sys.executable, copy.name, *first], capture_output=True, text=True, check=True)
-    assert "2 iterations, 32 control steps" in result.stdout and "semi_implicit with 16 substeps" in result.stdout
+    assert "2 iterations, 32 control steps" in result.stdout and "16 substeps: return median" in result.stdout
     (directory,) = Path("runs").glob("cartpole__my-bptt__1__*")
     path = directory / "checkpoint.pt"
     for arguments in (["--resume", str(path), "--iterations", "3", "--quiet"], ["--evaluate", str(path)]):

@@ -45,7 +45,7 @@ LONGEST = 1000  # bytes of what a page asks for
 
 
 class Wish(NamedTuple):
-    """What a page's user asks for."""
+    """A wish of a page's user."""
 
     move: tuple[float, ...] = (0.0, 0.0, 0.0)  # forward, left, turn to the left, each in [-1, 1] of the most
     pull: tuple[float, ...] = ()  # a body's number, and the point (3,) to which it is pulled, if any
@@ -131,7 +131,7 @@ def turned(angle: float, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Stage:
-    """What pages and the simulation share: how many pages there are, the latest wish and the latest picture."""
+    """State that pages and simulation share: the number of pages, the latest wish and the latest picture."""
 
     def __init__(self) -> None:
         self.changed, self.pages, self.wish, self.restart = threading.Condition(), 0, Wish(), False
@@ -164,7 +164,7 @@ class Stage:
 
 
 def is_here(host: str, own: str) -> bool:
-    """Whether a request's Host is an address, or a name of this machine: others could lead any web page here."""
+    """Tell whether a request's Host is an address, or a name of this machine: others could lead any web page here."""
     with suppress(ValueError):
         name = urlsplit(f"//{host}").hostname or ""
         return name in ("localhost", own.lower(), socket.gethostname().lower()) or bool(ipaddress.ip_address(name))

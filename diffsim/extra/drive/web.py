@@ -1,4 +1,4 @@
-"""What the page of `diffsim drive` draws of a scene; the page itself is assets/web.html."""
+"""Describe to the page of `diffsim drive` what it draws of a scene; the page itself is assets/web.html."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def fill_page(motion: dict[str, Any], title: str, caption: str) -> str:
 
 
 def describe(scene: Scene, control_dt: float, ghost: bool = False) -> dict[str, Any]:
-    """What keeps its shape: geoms, meshes, the ground, muscles (straight from point to point), and the camera's orbit.
+    """Describe what keeps its shape: geoms, meshes, ground, muscles (straight from point to point), the camera's orbit.
 
     control_dt [s] lies between two pictures. A ghost is a second, transparent robot. Terrain is that of the first
     environment.

@@ -21,7 +21,7 @@ class Linears(nn.Module):
         self.bias = nn.Parameter(torch.stack([layer.bias.detach().unsqueeze(0) for layer in layers]))
 
     def forward(self, x: Tensor, norms: LayerNorms | None = None) -> Tensor:
-        """Of normalized inputs, norms scale and shift them first: in the weights, which are fewer than the inputs."""
+        """Apply the layers; given norms scale and shift the inputs first, in the weights, which are fewer."""
         if norms is None:
             return torch.baddbmm(self.bias, x, self.weight)
         return torch.baddbmm(self.bias + norms.bias @ self.weight, x, norms.weight.mT * self.weight)
@@ -75,7 +75,7 @@ class Ensemble(nn.Module):
         return x if norms is None else torch.addcmul(norms.bias, x, norms.weight)
 
     def value(self, *inputs: Tensor) -> Tensor:
-        """What each says of the same inputs (B, ...), side by side, in its only output: (E, B)."""
+        """Return what each says of the same inputs (B, ...), side by side, in its only output: (E, B)."""
         x = torch.cat(inputs, -1)
         return self.forward(x.expand(self.count, *x.shape)).squeeze(-1)
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 
 class Transition(NamedTuple):
-    """What a learner needs of B control steps."""
+    """B control steps as a learner needs them."""
 
     obs: Tensor  # (B, obs_dim)
     action: Tensor  # (B, action_dim)

@@ -1,4 +1,4 @@
-"""What trajectories cost, with a quadratic model that is positive semidefinite: terms, and their sum. See ilqr.Cost."""
+"""Compute the cost of trajectories and its positive semidefinite quadratic model: terms and their sum, see ilqr.Cost."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ ALPHAS = 0.5 ** torch.arange(11, dtype=REAL)  # step sizes of the line search
 
 
 class Cost(Protocol):
-    """What is minimised, of R trajectories of T steps."""
+    """The problem of R trajectories of T steps."""
 
     def value(self, x: Tensor, u: Tensor) -> Tensor:
         """(R, A, T) cost of each step, of A candidates x (R, A, T + 1, nx), u (R, A, T, nu) for each trajectory."""

@@ -94,7 +94,7 @@ class System:
         return tangent
 
     def observe(self, x: Tensor) -> Tensor:
-        """What a policy sees (..., obs_dim) of x (..., nx)."""
+        """Return what a policy sees (..., obs_dim) of x (..., nx)."""
         return self._observe(x, self._no_action.expand(*x.shape[:-1], -1))
 
     def reward(self, x: Tensor, u: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ class Leg(NamedTuple):
 
 
 class Robot(NamedTuple):
-    """What the task knows of a robot."""
+    """A robot as the task knows it."""
 
     joints: tuple[str, ...]  # names in order of qpos
     home: tuple[float, ...]  # (joints,) [rad] of the keyframe
@@ -198,7 +198,7 @@ class Joystick(Task):
         return torch.cat((self._draw(drawn), *parts), dim=-1)
 
     def _pull(self, rand: Tensor) -> Tensor:
-        """What pulls during an episode, (..., 3) of rand (..., 3): along x and y [m/s^2], about z [rad/s^2]."""
+        """Draw what pulls during an episode, (..., 3) of rand (..., 3): along x and y [m/s^2], about z [rad/s^2]."""
         (least, most), (way, turn) = self.disturbances["pull"], (2.0 * rand[..., :2] - 1.0).split(1, dim=-1)
         size = least + (most - least) * rand[..., 2:]
         return size * torch.cat(((math.pi * way).cos(), (math.pi * way).sin(), SPIN * turn), dim=-1)

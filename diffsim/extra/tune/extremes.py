@@ -1,4 +1,4 @@
-"""How far a robot can be driven: masses, stiffness, speeds, drops and time steps at which integrators fail."""
+"""Measure how far a robot can be driven: masses, stiffness, speeds, drops and time steps at which integrators fail."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 
 
 def stress(motion: Motion, task: type[Task], contact: str) -> list[dict[str, str]]:
-    """Of each sweep the first value with which an integrator, at the task's default substeps, fails within 0.5 s.
+    """Find the first value of each sweep with which an integrator, at the task's default substeps, fails within 0.5 s.
 
     It fails where an environment is contained, or its kinetic energy passes twice the largest of a float64 reference.
     """

@@ -21,7 +21,7 @@ FACTORS = (0.125, 0.25, 0.5, 0.75, 1.0, 2.0, 4.0)  # substeps, in multiples of t
 
 
 class Row(NamedTuple):
-    """What an integration costs and errs. Errors are medians over the start states."""
+    """The cost and the errors of an integration. Errors are medians over the start states."""
 
     how: Integration
     # us of a control step of one environment, forward and with its gradient; root mean square over dofs [m, rad] after
@@ -42,7 +42,7 @@ class Row(NamedTuple):
 
 
 def flags(how: Integration) -> str:
-    """What a script is given to integrate so."""
+    """Write the flags that make a script integrate so."""
     words = ["--contact", how.contact, "--substeps", str(how.substeps)]
     if how.contact == "soft":
         words.append("--implicit" if how.implicit else "--no-implicit")
@@ -57,7 +57,7 @@ def integrator(how: Integration) -> str:
 
 
 def settings(task: type[Task], contact: str) -> list[Integration]:
-    """What is measured on a contact model: the task's presets, and others around its default."""
+    """List what is measured on a contact model: the task's presets, and others around its default."""
     presets = task.presets(contact)
     default = presets["default"]
     factors = (*FACTORS, 8.0) if contact == "mujoco" else FACTORS  # whose default has fewer substeps
@@ -75,7 +75,7 @@ def finest(found: Sequence[Integration]) -> Integration:
 
 
 class Reference:
-    """What an integration makes of a motion, to be compared with what others make of it."""
+    """Integrate a motion, to be compared with what others make of it."""
 
     def __init__(self, motion: Motion, how: Integration, dtype: torch.dtype = torch.float32) -> None:
         self.motion, self.trail, self.gradients = motion, motion.replay(how, dtype), motion.gradients(how, dtype)

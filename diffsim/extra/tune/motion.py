@@ -23,7 +23,7 @@ CHUNK = 8  # environments whose gradients are held at once
 
 
 class Trail(NamedTuple):
-    """What an integration makes of a motion."""
+    """The result of integrating a motion."""
 
     qpos: Tensor  # (T, N, nq), (T, N, nv) after each control step, in float64
     qvel: Tensor

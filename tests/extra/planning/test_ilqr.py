@@ -1,6 +1,8 @@
-"""Iterative LQR against dense solutions of linear-quadratic problems."""
+"""Planners against closed forms: iterative LQR, the controllers that it leaves, and L-BFGS."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +10,18 @@ import torch
 from systems import Linear, normal
 from torch import Tensor
 
-from diffsim.extra.planning import AfterStep, backward_pass, follow, ilqr, step_jacobian
+from diffsim.extra.planning import (
+    AfterStep,
+    backward_pass,
+    follow,
+    gaussian_log_prob,
+    ilqr,
+    maximum_entropy_controllers,
+    step_jacobian,
+)
+from diffsim.extra.planning.lbfgs import maximise
+
+# Iterative LQR --------------------------------------------------------------------------------------------------------
 
 
 def test_a_linear_system_is_solved_by_least_squares(rng: np.random.Generator) -> None:
@@ -55,3 +68,53 @@ def test_an_indefinite_cost_raises_mu_and_ends_without_an_exception(rng: np.rand
     plan = ilqr(system, hill, x, u, 60)
     assert (plan.cost < 0.5 * hill.value(x, u).sum(-1)).all()
     torch.testing.assert_close(hill.value(plan.x, plan.u).sum(-1), plan.cost)
+
+
+# Controllers ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_maximum_entropy_controller(rng: np.random.Generator) -> None:
+    """Q_uu^-1, with Q_uu the Schur complement of the dense cost to go, from the present action to the end."""
+    system, T = Linear(rng), 8
+    plan = ilqr(system, system.cost, *system.unforced(normal(rng, 1, 3), T), 3, mu=0.0)
+    (controller,) = maximum_entropy_controllers(system, system.cost, plan)
+    for t in range(T):
+        _, hessian = system.dense(T - t, plan.x[0, t])
+        q_uu = torch.linalg.inv(torch.linalg.inv(hessian)[:2, :2])  # the rest minimised out
+        covariance = controller.L[t] @ controller.L[t].mT
+        torch.testing.assert_close(covariance, torch.linalg.inv(q_uu), rtol=1e-8, atol=1e-12)
+    assert controller.mu == 0
+
+    noise = normal(rng, 40_000, 2, 2)
+    short = controller._replace(x=controller.x[:3], u=controller.u[:2], K=controller.K[:2], L=controller.L[:2])
+    x, u, _ = short.sample(system, noise)
+    torch.testing.assert_close(torch.cov(u[:, 0].mT), short.L[0] @ short.L[0].mT, rtol=0.05, atol=2e-4)
+    torch.testing.assert_close(short.mean(system, 1, x[:, 1]), short.mean(system, slice(0, 2), x[:, :2])[:, 1])
+    expected = torch.distributions.MultivariateNormal(torch.zeros(2).double(), scale_tril=short.L)
+    log_prob = expected.log_prob(torch.einsum("tij,mtj->mti", short.L, noise))
+    torch.testing.assert_close(short.log_prob(system, x, u), log_prob, rtol=1e-9, atol=1e-9)
+
+
+def test_log_density_of_independent_normals(rng: np.random.Generator) -> None:
+    u, mean, sigma = normal(rng, 4, 5, 2), normal(rng, 4, 5, 2), torch.tensor([0.3, 2.0]).double()
+    expected = torch.distributions.Normal(mean, sigma).log_prob(u).sum(-1)
+    torch.testing.assert_close(gaussian_log_prob(u, mean, sigma), expected)
+
+
+# L-BFGS ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_best_finite_point_is_returned() -> None:
+    start = torch.full((2,), 0.9, dtype=torch.float64)
+    best, value = maximise(lambda theta: (1 - theta.square().sum()).log(), start / 2, 30)  # NaN outside of a circle
+    assert abs(value) < 1e-8 and best.abs().max() < 1e-4
+    best, value = maximise(lambda theta: -theta.sum() * math.nan, start, 5)
+    assert torch.equal(best, start) and value == -math.inf
+
+
+def test_a_quadratic_is_solved() -> None:
+    root = torch.tensor([[2.0, 0.0, 0.0], [1.0, 0.5, 0.0], [-1.0, 3.0, 0.1]]).double()
+    target = torch.tensor([1.0, -2.0, 3.0]).double()
+    best, value = maximise(lambda theta: -(root @ (theta - target)).square().sum(), torch.zeros(3).double(), 50)
+    torch.testing.assert_close(best, target, rtol=1e-5, atol=1e-5)
+    assert abs(value) < 1e-10

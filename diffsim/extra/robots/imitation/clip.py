@@ -90,7 +90,7 @@ class Clip:
         return 0.5 * (torch.cat((before, step)) + torch.cat((step, after))) / control_dt
 
     def check(self, model: mujoco.MjModel) -> None:
-        """That a robot can follow it; raises ValueError for another width, joints far beyond their limits, or a loop
+        """Check that a robot can follow it; raises TaskError for another width, joints far beyond limits, or a loop
         that does not end as it begins."""
         if self.qpos.shape[1] != model.nq:
             raise TaskError(f"clip {self}: qpos has {self.qpos.shape[1]} columns, the robot has {model.nq}")

@@ -34,7 +34,7 @@ def matrix(quat: Tensor) -> Tensor:
 
 
 class Kinematics:
-    """Of a robot with a free root and, on each other body, hinges at its origin, as ant; else raises ValueError."""
+    """Forward kinematics of a free root and, on each other body, hinges at its origin; else raises ValueError."""
 
     def __init__(self, model: mujoco.MjModel, device: torch.device | str, dtype: torch.dtype) -> None:
         free, others = model.jnt_type[0], model.jnt_type[1:]

@@ -173,7 +173,7 @@ class HumanoidImitation(Imitation):
         return torch.cat((lag, rest), dim=-1), qvel
 
     def _places(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the end effectors (..., 12) and of the centre of mass (..., 3), in the frame of qpos (..., nq)."""
+        """Place the end effectors (..., 12) and of the centre of mass (..., 3), in the frame of qpos (..., nq)."""
         positions, rotations = self._kinematics(qpos)
         arms = (rotations.index_select(-3, self._bodies) * self._points.unsqueeze(-2)).sum(-1)
         ends = positions.index_select(-2, self._bodies) + arms

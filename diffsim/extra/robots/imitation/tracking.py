@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from diffsim.extra.gait import trace
 from diffsim.extra.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
 from diffsim.extra.robots.common import push, score
 from diffsim.extra.robots.imitation.clip import FASTEST, Clip
 from diffsim.extra.robots.imitation.kinematics import difference
 from diffsim.extra.robots.imitation.task import STRAY, Imitation, draw
 from diffsim.extra.variation import Ranges
-from diffsim.robot.contact import trace
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Array, Scene
 from diffsim.tasks.base import Contact, TaskError
