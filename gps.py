@@ -40,7 +40,7 @@ from diffsim.extra.planning.ilqr import ilqr
 from diffsim.extra.planning.lbfgs import maximise
 from diffsim.tasks import find_task
 from diffsim.tasks.base import ASSETS
-from diffsim.training import distributed, evaluate_checkpoint, fail, script
+from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer
@@ -73,6 +73,7 @@ EXAMPLES = ASSETS / "examples"  # by task; benchmarks/gps_examples.py records th
 class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
+    processes: ClassVar[bool] = False
     fixed: ClassVar = ("horizon", "action_cost", "demonstration", "noise")
 
     iterations: Count = 80
@@ -121,8 +122,6 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        if distributed.size() > 1:
-            fail("trains in one process; start it without torchrun")
         task = find_task(self.env)
         if task.varied_by or hasattr(task, "slope"):
             fail(f"guides are of one robot on a plane, but {self.env} varies: leave its options out")

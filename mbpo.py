@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -27,7 +27,7 @@ from diffsim.extra.learning.ensemble import Ensemble
 from diffsim.extra.learning.replay import ReplayBuffer, Transition
 from diffsim.extra.planning import System
 from diffsim.tasks import find_task
-from diffsim.training import Run, distributed, fail, script
+from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
@@ -70,6 +70,8 @@ HELD_OUT_BATCH = 1024
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
+
+    processes: ClassVar[bool] = False
 
     num_envs: Count = 64
     """parallel environments N (per task)"""
@@ -125,7 +127,6 @@ class Args(Flags):
         seeding = f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}: at most {most}"
         wrong = {
             seeding: self.seed_steps > most,
-            "start it without torchrun: processes do not share a replay buffer": distributed.size() > 1,
             "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
             f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
             f"--rollout-lengths {first} {last}: the first must not exceed the second": first > last,

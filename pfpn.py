@@ -14,16 +14,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import Run, distributed, fail, script
+from diffsim.extra.learning.likeliest import Likeliest
+from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments
+from diffsim.training.layers import ObsNormalizer, mlp, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import AtLeast2, Bounds, Count, Decay, Fraction, NonNegative, Positive, SomeWidths, UpTo10k
 
@@ -48,6 +49,8 @@ MAX_GRAD_NORM, TARGET_KL, CLIP, VALUE_COEF, BOUND_COEF = 1.0, 0.008, 0.2, 2.0, 1
 class Args(Flags):
     """The policy, and PPO. Defaults are the humanoid's."""
 
+    processes: ClassVar[bool] = False
+
     policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
     """particles; one Gaussian; a mixture whose locations and scales also depend on the state; fixed bins"""
     std: Literal["state", "own"] = "state"
@@ -68,7 +71,7 @@ class Args(Flags):
     """weight that decides: the mean over the recorded steps, or the largest (Eq. 8)"""
 
     num_envs: Count = 1024
-    """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
+    """parallel environments N (per task; on a CPU at most 256)"""
     horizon: Count = 32
     """control steps of a rollout (per task)"""
     hidden: SomeWidths = (256, 128, 64)
@@ -273,8 +276,6 @@ class Resampling(nn.Module):
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
         due = self.age % self.args.resampling_interval == 0
-        every = distributed.stack(self.seen)
-        self.seen.copy_(torch.stack((every[:, 0].mean(0), every[:, 1].amax(0))))  # ranks decide and resume alike
         weight = self.seen[0] / self.seen[0].sum(-1, keepdim=True)  # where nothing was recorded not a number
         least, largest = self.args.dead / head.shape[1], torch.maximum(weight, self.seen[1])
         below = {"mean": weight < least, "max": largest < least}  # Eq. 8 has the second
@@ -296,7 +297,7 @@ class Resampling(nn.Module):
         |D| copies share the weight of their target: log(|D| + 1) less in each logit. Adam's moments of them are zeroed.
         """
         m, n = head.shape
-        draws = distributed.stack(torch.empty(m, n, n, device=dead.device).exponential_())[0]
+        draws = torch.empty(m, n, n, device=dead.device).exponential_()
         target = torch.where(dead, (chance.unsqueeze(1) / draws).argmax(-1), torch.arange(n, device=dead.device))
         copies = torch.zeros_like(chance).scatter_add(1, target, dead.to(chance.dtype))
         head.linear.bias.data.view(m, n).sub_(torch.log1p(copies))
@@ -305,7 +306,7 @@ class Resampling(nn.Module):
             rows.copy_(rows.gather(1, target.unsqueeze(-1).expand_as(rows)))
             for moment in optimizer.moments(parameter):
                 moment.view(m, n, -1).masked_fill_(dead.unsqueeze(-1), 0.0)
-        uniform = distributed.stack(2 * torch.rand_like(head.loc) - 1)[0]
+        uniform = 2 * torch.rand_like(head.loc) - 1
         head.loc.add_(dead * self.args.resampling_noise * uniform * head.log_std.exp())
         self.moved += dead.sum()
 
@@ -346,7 +347,7 @@ class PPO:
         self.resampling = Resampling(args, self.actor.head).to(env.device)
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.lr)
-        self.minibatches = math.ceil(args.horizon * env.num_envs / args.minibatch_size * distributed.size())
+        self.minibatches = math.ceil(args.horizon * env.num_envs / args.minibatch_size)
 
     def iterate(self) -> dict[str, Tensor]:
         """Act for a rollout, descend the clipped loss in epochs of minibatches, then resample; returns metrics.
@@ -393,7 +394,7 @@ class PPO:
         """Take one step on a minibatch, with a learning rate that keeps the policy near the one that acted."""
         mixture, value = self.actor(batch.obs)
         log_ratio = mixture.log_prob(batch.action) - batch.log_prob
-        kl = distributed.average((log_ratio.detach().expm1() - log_ratio.detach()).mean())  # estimated; not below zero
+        kl = (log_ratio.detach().expm1() - log_ratio.detach()).mean()  # estimated; not below zero
         up, down = (x.to(kl.dtype) for x in (kl < TARGET_KL / 2, kl > 2 * TARGET_KL))
         self.optimizer.lr.mul_(1.5 ** (up - down)).clamp_(*self.args.lr_bounds)
         ratio = log_ratio.exp()

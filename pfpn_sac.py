@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -23,10 +23,11 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.learning.ensemble import Ensemble
+from diffsim.extra.learning.likeliest import Likeliest
 from diffsim.extra.learning.replay import ReplayBuffer, Transition
-from diffsim.training import Run, distributed, fail, script
+from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import Likeliest, ObsNormalizer, mlp
+from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import AtLeast2, Batch, Count, Decay, Fraction, NonNegative, Positive, SomeWidths, UpTo10k
 
@@ -51,6 +52,8 @@ DENSITY = 0.01  # of an action, at least, in the implicit gradient
 @dataclass
 class Args(Flags):
     """The policy, and SAC. Defaults are the humanoid's."""
+
+    processes: ClassVar[bool] = False
 
     policy: Literal["pfpn", "gaussian"] = "pfpn"
     """particles, or one Gaussian"""
@@ -93,8 +96,6 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        if distributed.size() > 1:
-            fail("start it without torchrun: processes do not share a replay buffer")
         if self.buffer_size < (steps := self.horizon * self.num_envs):
             fail(f"--buffer-size {self.buffer_size} is smaller than a rollout of {steps} steps")
 

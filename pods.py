@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +22,7 @@ from diffsim import DiffEnv
 from diffsim.extra.planning import REAL, AfterStep, Cost, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import mlp
 from diffsim.training.ranges import Count, NonNegative, Positive, UpTo10k, Widths
@@ -46,6 +46,8 @@ MAX_GRAD_NORM = 1.0  # of the imitation
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
+
+    processes: ClassVar[bool] = False
 
     iterations: Count = 120
     """learning iterations (per order)"""
@@ -85,8 +87,6 @@ class Args(Flags):
     def check(self) -> None:
         super().check()
         task = find_task(self.env)
-        if distributed.size() > 1:
-            fail("start it without torchrun: processes do not share sequences")
         if task.num_memory:
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if task.varied_by or hasattr(task, "slope"):

@@ -20,9 +20,10 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.mirror import Mirror
-from diffsim.training import Run, distributed, script
+from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.training import Run, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import ObsNormalizer, make_symmetric, mirror_inputs, mirror_outputs, mlp, moments
+from diffsim.training.layers import ObsNormalizer, mlp, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Bounds, Count, Finite, Fraction, Natural, NonNegative, Positive, UpTo10k, Widths
 
@@ -108,13 +109,13 @@ class ActorCritic(nn.Module):
 
     def make_alike(self, mirror: Mirror) -> None:
         """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
-        self.normalizer.mirror = mirror.obs
+        mirror_statistics(self.normalizer, mirror.obs)
         for features in (self.features, self.own):
             if features is not None:
                 mirror_inputs(features, mirror.obs)
         mirror_outputs(self.mean, mirror.action)
         mirror_outputs(self.value, mirror.value)
-        make_symmetric(self, "log_std", mirror.action)
+        mirror_parameter(self, "log_std", mirror.action)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
@@ -163,7 +164,7 @@ class PPO:
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, MAX_GRAD_NORM, lr=args.lr)
-        self.minibatches = math.ceil(args.horizon * env.num_envs / args.minibatch_size * distributed.size())
+        self.minibatches = math.ceil(args.horizon * args.num_envs / args.minibatch_size)
 
     def iterate(self) -> dict[str, Tensor]:
         """Act for a rollout, and descend the clipped loss on its samples; returns metrics.
@@ -208,7 +209,7 @@ class PPO:
                 b = Batch(*tensors)
                 mean, value = policy(b.obs)
                 kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
-                adapt(optimizer.lr, distributed.average(kl), TARGET_KL, args.lr_bounds)
+                adapt(optimizer.lr, optimizer.average(kl), TARGET_KL, args.lr_bounds)
                 ratio = log_ratio(b, mean, policy.log_std, old_log_std).exp()
                 policy_loss = clipped_loss(ratio, b.advantage, CLIP)
                 value_loss = (value - b.target).square().mean()

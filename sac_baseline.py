@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.extra.learning.ensemble import Ensemble
 from diffsim.extra.learning.replay import ReplayBuffer, Transition
-from diffsim.training import Run, distributed, fail, script
+from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.optimizer import ClippedAdam
@@ -54,6 +54,8 @@ TARGET_ENTROPY = -1.0  # nats per action
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
+
+    processes: ClassVar[bool] = False
 
     iterations: Count = 20_000
     """learning iterations: --steps control steps of all environments, each followed by updates (per task)"""
@@ -104,8 +106,6 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        if distributed.size() > 1:
-            fail("start it without torchrun: processes do not share a replay buffer")
         if self.critic_subset > self.critics:
             fail(f"--critic-subset {self.critic_subset} is larger than --critics {self.critics}")
         if self.seed_steps > (most := self.iterations * self.steps - 1):

@@ -21,10 +21,11 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
 from diffsim.extra.learning.ensemble import Ensemble, EnsembleAdam
+from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
 from diffsim.tasks import TASKS
-from diffsim.training import Run, distributed, fail, script
+from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import ObsNormalizer, make_symmetric, mirror_inputs, mirror_outputs, mlp
+from diffsim.training.layers import ObsNormalizer, mlp
 from diffsim.training.ranges import Count, Finite, Fraction, NonNegative, Positive, SomeWidths, UpTo10k, UpTo1000
 
 # SHAC's networks, and the settings of the best results (docs/sapo.md).
@@ -122,13 +123,6 @@ class Args(Flags):
             values |= {"substeps": how.substeps, "implicit": how.implicit}
         return super().task_defaults() | values | BALANCING.get(self.task, {})
 
-    def check(self) -> None:
-        super().check()
-        if (self.num_envs // distributed.size()) % self.population:
-            fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")
-        if MINIBATCHES > (samples := self.horizon * self.num_envs // distributed.size() // self.population):
-            fail(f"--horizon {self.horizon} gives each critic {samples} samples: at least {MINIBATCHES} are needed")
-
 
 # Networks -------------------------------------------------------------------------------------------------------------
 
@@ -189,6 +183,10 @@ class SAPO:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env, K = args, env, args.population
+        if env.num_envs % K:
+            fail(f"--num-envs {args.num_envs} cannot be split evenly among --population {K}, in each process")
+        if MINIBATCHES > (samples := args.horizon * env.num_envs // K):
+            fail(f"--horizon {args.horizon} gives each critic {samples} samples: at least {MINIBATCHES} are needed")
         self.actor = Actor(args, env).to(env.device)
         options = args.critic_hidden, 1, ACTIVATIONS[args.activation]
         critics = [mlp(env.task.obs_dim, *options, norm=True, orthogonal=True) for _ in range(args.critics * K)]
@@ -209,13 +207,13 @@ class SAPO:
     def make_alike(self) -> None:
         """Treat left and right alike: mirrored states get mirrored actions with the same noise, and the same value."""
         mirror, actor = self.env.task.mirror, self.actor
-        actor.normalizer.mirror = mirror.obs
+        mirror_statistics(actor.normalizer, mirror.obs)
         for inputs in (actor.body, self.critics):
             mirror_inputs(inputs.layers, mirror.obs)
         outputs = [(actor.mean, mirror.action), (self.critics, mirror.value)]
         for network, output in outputs + ([(actor.spread, mirror.size)] if actor.spread else []):
             mirror_outputs(network.layers, output)
-        make_symmetric(actor, "log_std", mirror.action)
+        mirror_parameter(actor, "log_std", mirror.action)
 
     @property
     def optimizers(self) -> tuple[EnsembleAdam, ...]:
@@ -274,7 +272,7 @@ class SAPO:
         entropy, gained = (self.split(x.detach()).mean(-1) for x in (rollout.entropy, rollout.reward))  # (K,)
         surplus = (self.temperature["log"].exp() * (entropy - self.target_entropy)).sum()
         self.temperature_optimizer.step(self.temperature_optimizer.gradient(surplus))
-        self.score["reward"].lerp_(distributed.average(gained), SCORE_RATE)
+        self.score["reward"].lerp_(self.actor_optimizer.average(gained), SCORE_RATE)
 
         # Fit the critics to the soft TD(lambda) returns; the target critics follow.
         obs = rollout.obs.detach()

@@ -21,9 +21,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
+from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import Chain, make_symmetric, mirror_inputs, mirror_outputs, mlp
+from diffsim.training.layers import Chain, mlp
 from diffsim.training.ranges import Count, Fraction, LogStd, Natural, NonNegative, Positive, UpTo10k, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
@@ -101,7 +102,7 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        if self.critic_minibatches > (samples := self.num_envs * self.horizon // distributed.size()):
+        if self.critic_minibatches > (samples := self.num_envs * self.horizon):
             fail(f"--critic-minibatches {self.critic_minibatches} are more than the {samples} samples of a rollout")
 
 
@@ -165,11 +166,11 @@ class SHAC:
     def make_alike(self) -> None:
         """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
         mirror = self.env.task.mirror
-        self.actor.normalizer.mirror = mirror.obs
+        mirror_statistics(self.actor.normalizer, mirror.obs)
         for network, output in ((self.actor.mean, mirror.action), (self.critic, mirror.value)):
             mirror_inputs(network, mirror.obs)
             mirror_outputs(network, output)
-        make_symmetric(self.actor, "log_std", mirror.action)
+        mirror_parameter(self.actor, "log_std", mirror.action)
 
     def iterate(self) -> dict[str, Tensor]:
         """One iteration of Algorithm 1; returns metrics.

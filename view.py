@@ -18,9 +18,10 @@ import torch
 import tyro
 
 from diffsim.extra import gait, render
-from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.extra.watch import VIDEO_SECONDS, film_median, make_policy_env
+from diffsim.training import command, evaluate, fail, load_policy
 from diffsim.training.errors import in_one_line
-from diffsim.training.evaluation import SEED, VIDEO_SECONDS
+from diffsim.training.evaluation import SEED
 
 
 @dataclass
@@ -73,7 +74,7 @@ def show(args: Args) -> None:
     evaluation = evaluate(env, saved.network, args.seed)
     print(f"{env.task.name}, {saved}, {args.episodes} episodes: {evaluation}")
     print(*gait.lines(gait.of_evaluation(evaluation)), sep="\n")
-    print(f"video: {evaluation.save_video(args.video, args.seconds, size=args.size)}")
+    print(f"video: {film_median(evaluation, args.video, args.seconds, size=args.size)}")
 
 
 if __name__ == "__main__":

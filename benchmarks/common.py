@@ -18,10 +18,10 @@ from tables import ROOT, Row
 
 from diffsim import DiffEnv
 from diffsim.extra.variation import on_a_plane
+from diffsim.extra.watch import make_policy_env
 from diffsim.sim.options import check_device
 from diffsim.tasks import TaskError, find_task
-from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy, make_policy_env
-from diffsim.training.distributed import choose_device
+from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy
 from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
 
@@ -191,7 +191,8 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
     check_ranges(args)
     if args.output and args.update_results:
         fail("--output and --update-results exclude each other")
-    args.device = choose_device(args.device)
+    if args.device == "auto":
+        args.device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         check_device(args.device)
     except ValueError as error:

@@ -34,7 +34,7 @@ STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_s
 def check_seed(seed: int) -> int:
     """Return the seed as an int; raises ValueError unless it is an integer of 64 bits, which True is not."""
     if not isinstance(seed, Integral) or isinstance(seed, bool) or not -(2**63) <= seed < 2**63:
-        raise ValueError(f"seed is {seed!r}, must be one integer of 64 bits; a NumPy vector environment takes one each")
+        raise ValueError(f"seed is {seed!r}, must be one integer of 64 bits, which seeds all environments of a batch")
     return int(seed)
 
 

@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -103,6 +104,7 @@ def load(module: wp.Module, device: str, block_dim: int, name: str) -> None:
     try:
         if any(folder.glob(pattern)):
             try:
+                _check_objects(folder)
                 module.load(device, block_dim)
                 return
             except Exception:  # Warp's and json's
@@ -113,8 +115,19 @@ def load(module: wp.Module, device: str, block_dim: int, name: str) -> None:
             print(f"compiling kernels for {name} (once, about 10 s) ...", file=sys.stderr, flush=True)
         _announced.add(name)
         module.load(device, block_dim)
+        _check_objects(folder)
     except OSError as error:
         raise KernelCacheError(wp.config.kernel_cache_dir, error) from error
+
+
+def _check_objects(folder: Path) -> None:
+    """Store checksums of a CPU's kernels, or raise ValueError if one has changed: it would crash the process."""
+    for path in folder.glob("*.o"):
+        found, stored = f"{zlib.crc32(path.read_bytes()):08x}", path.with_suffix(".crc")
+        if not stored.exists():
+            stored.write_text(found)
+        elif stored.read_text() not in ("", found):  # empty while another process writes it
+            raise ValueError(f"{path} has changed")
 
 
 @contextmanager

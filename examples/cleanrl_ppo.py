@@ -42,7 +42,7 @@ class CleanRLVectorEnv(VectorWrapper):
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[np.float32], Any, Any, Any, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.env.step(actions)
         episodes: list[Any] = [None] * self.num_envs
-        for i in np.flatnonzero(info["_episode"]):
+        for i in np.flatnonzero(info.get("_episode", ())):
             episodes[i] = {"episode": {key: column[i] for key, column in info["episode"].items()}}
         return self.normalize(obs), reward, terminated, truncated, {"final_info": episodes} if any(episodes) else {}
 
@@ -50,6 +50,7 @@ class CleanRLVectorEnv(VectorWrapper):
 def make_envs(env_id: str, num_envs: int, gamma: float) -> VectorEnv[Any, Any, Any]:
     """What CleanRL's continuous-action scripts make of num_envs environments; actions are clipped by the task."""
     envs: VectorEnv[Any, Any, Any] = gymnasium.make_vec(env_id, num_envs=num_envs)
+    envs = wrappers.vector.RecordEpisodeStatistics(envs)
     envs = wrappers.vector.NormalizeReward(envs, gamma)
     return CleanRLVectorEnv(wrappers.vector.ClipReward(envs, -10, 10))
 

@@ -9,9 +9,11 @@ The file's metadata tell all about the policy (docs/viewing.md). A servo gets th
 
 import argparse
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import glfw
 import mujoco
 import mujoco.viewer
 import numpy as np
@@ -46,6 +48,20 @@ def walk(policy: InferenceSession, model: mujoco.MjModel, command: Sequence[floa
         yield data
 
 
+def check_opengl(model: mujoco.MjModel, video: bool) -> None:
+    """Raise RuntimeError where a window or a video cannot be drawn; MuJoCo's window would end the process."""
+    if video:
+        try:
+            mujoco.Renderer(model, 8, 8).close()
+        except Exception as error:  # a class for each way to have no OpenGL
+            raise RuntimeError(f"no OpenGL: set MUJOCO_GL=egl or MUJOCO_GL=osmesa ({error})") from error
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of GLFW
+        if not glfw.init():
+            raise RuntimeError("a window needs a display: without one, give --video go2.mp4 and set MUJOCO_GL=egl")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policy", help="an ONNX file of go1, go2 or g1")
@@ -64,6 +80,10 @@ if __name__ == "__main__":
     if any(abs(x) > float(most) for x, most in zip(args.command, told["command_range"].split(","), strict=True)):
         parser.error(f"--command: of a {told['task']} at most {told['command_range']} to either side")
     model = mujoco.MjModel.from_xml_path(args.model or f"{Path(__file__).parents[1]}/diffsim/assets/{told['task']}.xml")
+    try:
+        check_opengl(model, bool(args.video))
+    except RuntimeError as error:
+        parser.error(str(error))
     states, camera = walk(policy, model, args.command, args.seconds), mujoco.MjvCamera()
     camera.type, camera.trackbodyid, camera.distance = mujoco.mjtCamera.mjCAMERA_TRACKING, 1, 2.0
     if args.video:

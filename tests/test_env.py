@@ -149,7 +149,10 @@ def test_reset_begins_a_window_and_keeps_its_seed():
     "arguments, message",
     [
         *((dict(options=options), "but reset takes none") for options in (5, {"mask": True})),
-        *((dict(seed=seed), "must be one integer of 64 bits") for seed in (True, 1.5, "a", [1, 2], 10**30)),
+        *(
+            (dict(seed=seed), "must be one integer of 64 bits, which seeds all")
+            for seed in (True, 1.5, "a", [1, 2], 10**30)
+        ),
     ],
 )
 def test_reset_refuses(arguments, message):
@@ -158,6 +161,22 @@ def test_reset_refuses(arguments, message):
     with pytest.raises(ValueError, match=message):
         env.reset(**arguments)
     assert_same(env.qpos, qpos)
+
+
+LAYOUTS = {
+    r"action is torch.sparse_coo \(4, 1\) torch.float32 cpu, must be": torch.Tensor.to_sparse,
+    r"action is torch.sparse_csr \(4, 1\) torch.float32 cpu, must be": torch.Tensor.to_sparse_csr,
+    "action is nested, must be": lambda dense: torch.nested.nested_tensor([*dense]),
+    "action is torch.jagged nested, must be": lambda dense: torch.nested.nested_tensor([*dense], layout=torch.jagged),
+}
+
+
+@pytest.mark.parametrize("message", LAYOUTS)
+@pytest.mark.filterwarnings("ignore")  # torch's, about its layouts
+def test_actions_of_other_layouts_are_refused(message):
+    env = diffsim.make("cartpole", num_envs=4, seed=0)
+    with pytest.raises(ValueError, match=rf"{message} a torch.Tensor of \(4, 1\) torch.float32 cpu"):
+        env.step(LAYOUTS[message](torch.zeros(4, 1)))
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")

@@ -89,6 +89,20 @@ def test_pictures(tmp_path: Path) -> None:
         load("trajectory_optimisation").optimise(video=tmp_path / "swing_up.avi")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [([], "without one, give --video go2.mp4 and set MUJOCO_GL=egl"), (["--video", "a.mp4"], "set MUJOCO_GL=egl or")],
+)
+def test_onnx_without_a_display_is_one_line(arguments: list[str], hint: str, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    main(["export", str(POLICIES / "go2.pt"), str(output := tmp_path / "policy.onnx")])
+    blind = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    command = [sys.executable, ROOT / "examples" / "run_onnx.py", output, *arguments]
+    blind |= PATH | {"MUJOCO_GL": "glfw"}
+    found = subprocess.run(command, env=blind, cwd=tmp_path, capture_output=True, text=True)
+    assert found.returncode == 2 and hint in found.stderr.splitlines()[-1] and not list(tmp_path.glob("*.mp4"))
+
+
 @pytest.mark.parametrize("name, file", [("go2", "go2.xml"), ("go2", "motors.xml"), ("g1", "g1.xml")])
 def test_onnx_acts_and_walks_as_the_policy_is_judged(name: str, file: str, tmp_path: Path) -> None:
     """Beside benchmarks/joystick.py's world for 2 s; with motors in another order, too."""

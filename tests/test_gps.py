@@ -18,7 +18,8 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.extra.planning import LinearGaussian, System, save_demonstration
-from diffsim.training import Evaluation, evaluate, load_policy, make_policy_env, parse
+from diffsim.extra.watch import make_policy_env
+from diffsim.training import Evaluation, evaluate, load_policy, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from gps import log_mixture, phi, sparse
@@ -399,10 +400,3 @@ def test_bad_input_is_one_line_and_exit_code_2(
     arguments, message = (text.replace("{hopper}", f"{gps.EXAMPLES / 'hopper.npz'}") for text in (arguments, message))
     env = "" if "--env" in arguments else "--env cartpole "
     assert_refuses(gps, env + arguments, message, trained, tmp_path, capsys)
-
-
-def test_torchrun_is_refused(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    assert_refuses(gps, "--env cartpole", "start it without torchrun", trained, tmp_path, capsys)

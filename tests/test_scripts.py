@@ -108,6 +108,7 @@ def test_files_of_a_run(script, trained, checkpoint):
         "args.json",
         "checkpoint.pt",
         "evaluation.json",
+        "lock",
         "progress.csv",
     }
     arguments = json.loads((trained / "args.json").read_text())

@@ -12,7 +12,8 @@ from learners import refusal
 
 import view
 from diffsim.extra import commands as command
-from diffsim.training import load_policy, make_policy_env
+from diffsim.extra.watch import make_policy_env
+from diffsim.training import load_policy
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif"])

@@ -37,7 +37,8 @@ from diffsim.extra.gait import TOUCHING, contact_bodies, trace
 from diffsim.extra.render import Frame, Renderer, whole_file
 from diffsim.extra.robots.imitation.tracking import Tracking
 from diffsim.extra.robots.joystick import Joystick
-from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.extra.watch import make_policy_env
+from diffsim.training import command, evaluate, fail, load_policy
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from common import Case, load_case  # noqa: E402

@@ -16,7 +16,8 @@ from tyro.conf import Positional
 
 from diffsim.extra.render import whole_file
 from diffsim.extra.robots.imitation.clip import Clip, tangent
-from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.extra.watch import make_policy_env
+from diffsim.training import command, evaluate, fail, load_policy
 
 SETTLING = 3.0  # s at the start of the episode that are left out
 SHORTEST = 0.3  # s

@@ -24,10 +24,11 @@ from diffsim.extra import render
 from diffsim.extra.export import export_onnx, export_policy
 from diffsim.extra.report import report as report_robot
 from diffsim.extra.tune import tune
+from diffsim.extra.watch import film_median, make_policy_env
 from diffsim.robot.constraint import check_soft, constrained
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Contact, base_name, find_task
-from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.training import command, evaluate, fail, load_policy
 from diffsim.training.checkpoint import POLICIES
 from diffsim.training.errors import in_one_line
 
@@ -82,7 +83,7 @@ def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None
         env.episode_length = min(env.episode_length, round(DEMO_SECONDS / env.control_dt))
         evaluation = evaluate(env, saved.network)
     print(f"{task}, {saved}, the first {DEMO_SECONDS:g} s of {DEMO_EPISODES} episodes: {evaluation}")
-    print(f"video: {evaluation.save_video(output)}")
+    print(f"video: {film_median(evaluation, output)}")
 
 
 def shipped_tasks() -> list[str]:

@@ -29,7 +29,12 @@ def export_policy(path: str | os.PathLike[str], output: Path, half: bool = False
     state = load(path)
     if half:
         state["policy"]["weights"] = {name: w.half() for name, w in state["policy"]["weights"].items()}
-    write(output, {name: value for name, value in state.items() if name in {"format", "simulator", "task", *POLICY}})
+        if wide := [name for name, w in state["policy"]["weights"].items() if not w.isfinite().all()]:
+            fail(f"{path}: weight {wide[0]} of the policy is too large for 16 bits")
+    write(
+        output,
+        {name: value for name, value in state.items() if name in {"format", "robot", "simulator", "task", *POLICY}},
+    )
 
 
 def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:

@@ -65,8 +65,10 @@ class NumpyVectorEnv(VectorWrapper):
 
     @torch.no_grad()
     def step(self, actions: ArrayLike) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], Info]:
-        """See DiffEnv.step."""
-        return to_numpy(self.env.step(to_action(self.unwrapped, actions)))
+        """See DiffEnv.step. The info leaves "episode" to gymnasium's RecordEpisodeStatistics, which refuses its own."""
+        *results, info = self.env.step(to_action(self.unwrapped, actions))
+        own = {name: value for name, value in info.items() if name not in ("episode", "_episode")}
+        return to_numpy((*results, own))
 
 
 def to_action(env: Any, array: ArrayLike) -> torch.Tensor:

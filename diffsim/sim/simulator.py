@@ -252,7 +252,8 @@ class Simulator:
         found: tuple[object, ...] = (type(value).__name__,)
         if isinstance(value, torch.Tensor):
             refuse_transforms(value)
-            found = tuple(value.shape), value.dtype, value.device
+            found = ("nested",) if value.is_nested else (tuple(value.shape), value.dtype, value.device)
+            found = found if value.layout == torch.strided else (value.layout, *found)
         if found != (wanted := ((self.num_envs, *size), self.dtype, self.device)):
             have, must = (" ".join(map(str, each)) for each in (found, wanted))
             raise ValueError(f"{name} is {have}, must be a torch.Tensor of {must}")

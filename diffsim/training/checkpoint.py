@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Protocol
 
 import torch
@@ -17,27 +18,28 @@ from torch import nn
 from diffsim.env import DiffEnv
 from diffsim.tasks import FILE, TASKS, base_name, restore_task
 from diffsim.training.errors import fail
-from diffsim.training.layers import First, Likeliest, MirrorMean, ObsNormalizer, WithMirrorImage
 
 POLICIES = Path(__file__).resolve().parents[1] / "policies"  # that come with the package
 FORMAT = 2
 POLICY = {"script", "args", "iteration", "policy"}  # what an exported policy has
+SHOWN = ("script", "iteration", "simulator")  # in messages, besides args
+PROVENANCE = "diffsim.extra.provenance"  # of the robot
 HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one
 
-# What a policy may consist of, and the attributes that its constructor takes.
-LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
-    "ELU": (nn.ELU, ()),
-    "First": (First, ("columns",)),
-    "LayerNorm": (nn.LayerNorm, ("normalized_shape",)),
-    "Likeliest": (Likeliest, ("actions", "components", "shared")),
-    "Linear": (nn.Linear, ("in_features", "out_features")),
-    "MirrorMean": (MirrorMean, ("size",)),
-    "ObsNormalizer": (ObsNormalizer, ("size",)),
-    "ReLU": (nn.ReLU, ()),
-    "SiLU": (nn.SiLU, ()),
-    "Softplus": (nn.Softplus, ()),
-    "Tanh": (nn.Tanh, ()),
-    "WithMirrorImage": (WithMirrorImage, ("size",)),
+# What a policy may consist of, where it is, and the attributes that its constructor takes.
+LAYERS = {
+    "ELU": ("torch.nn:ELU", ()),
+    "First": ("diffsim.training.layers:First", ("columns",)),
+    "LayerNorm": ("torch.nn:LayerNorm", ("normalized_shape",)),
+    "Likeliest": ("diffsim.extra.learning.likeliest:Likeliest", ("actions", "components", "shared")),
+    "Linear": ("torch.nn:Linear", ("in_features", "out_features")),
+    "MirrorMean": ("diffsim.extra.symmetry:MirrorMean", ("size",)),
+    "ObsNormalizer": ("diffsim.training.layers:ObsNormalizer", ("size",)),
+    "ReLU": ("torch.nn:ReLU", ()),
+    "SiLU": ("torch.nn:SiLU", ()),
+    "Softplus": ("torch.nn:Softplus", ()),
+    "Tanh": ("torch.nn:Tanh", ()),
+    "WithMirrorImage": ("diffsim.extra.symmetry:WithMirrorImage", ("size",)),
 }
 
 
@@ -58,6 +60,7 @@ class SavedPolicy:
     args: dict[str, Any]  # with which arguments, env among them
     iteration: int
     simulator: str = HOME
+    robot: str | None = None  # its fingerprint, in newer checkpoints
 
     def __str__(self) -> str:
         return f"{self.script}.py, iteration {self.iteration}"
@@ -132,6 +135,9 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         form = state["format"]
         whole = whole and (form != FORMAT or state.keys() >= POLICY)
+        if whole and form == FORMAT:
+            shown = *state["args"], *state["args"].values(), *(state.get(name) for name in SHOWN)
+            whole = all(str(text).isprintable() for text in shown)  # no codes for a terminal in what messages show
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         whole = False
     if not whole:
@@ -149,15 +155,22 @@ def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
     state = load(path)
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
-            network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
+            layers = (resolve_name(LAYERS[name][0])(*arguments) for name, *arguments in state["policy"]["layers"])
+            network = nn.Sequential(*layers)
             kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
+        if any(w.is_complex() for w in state["policy"]["weights"].values()):
+            raise TypeError("complex weights")
         weights = {name: w.to(kinds[name]) for name, w in state["policy"]["weights"].items()}  # searched in float64
         network.load_state_dict(weights, assign=True)
         if task := TASKS.get(base_name(state["args"]["env"])):
             network(torch.zeros(1, task.obs_dim))  # on the device meta this would take seconds, of torch's imports
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a complete checkpoint: its policy's weights do not fit its layers or its task")
-    return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))
+    for name, weight in network.state_dict().items():
+        if not bool(weight.isfinite().all()):
+            fail(f"{path}: weight {name} of the policy is not finite")
+    others = state.get("simulator", HOME), state.get("robot")
+    return SavedPolicy(network, state["script"], state["args"], state["iteration"], *others)
 
 
 def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import math
 import os
+import socket
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -28,7 +30,8 @@ def check_writable(directory: Path) -> None:
     try:
         str(directory).encode()  # tensorboard writes it
         existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
-        tempfile.TemporaryFile(dir=existing).close()
+        with tempfile.TemporaryFile(dir=existing) as file:
+            file.write(bytes(1000))  # a full disk has room for an empty file
     except (OSError, UnicodeError) as error:
         fail(f"cannot write to run directory {directory}: {getattr(error, 'strerror', 'its name is not UTF-8')}")
 
@@ -42,6 +45,29 @@ def make_unused(wanted: Path) -> Path:
         except FileExistsError:
             wanted = wanted.with_name(f"{wanted.name.partition('.')[0]}.{number}")
     raise AssertionError
+
+
+def lock(directory: Path) -> TextIO:
+    """End the script if another process runs in a directory; else keep others out until the file is closed.
+
+    The operating system holds the lock, so a killed process leaves none.
+    """
+    try:
+        file = (directory / "lock").open("a+")
+    except OSError as error:
+        fail(f"cannot write to run directory {directory}: {error.strerror}")
+    with suppress(ImportError):  # of Windows
+        import fcntl
+
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):  # others: the file system has no locks
+                file.seek(0)
+                fail(f"{directory} is in use by {file.read().strip()}: wait for its end, or choose another --run-dir")
+    file.truncate(0)
+    print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
+    return file
 
 
 class EpisodeStatistics:
@@ -70,38 +96,33 @@ class ProgressFile:
 
     def __init__(self, path: Path, iteration: int) -> None:
         self.path, self.columns = path, list(COLUMNS)
-        self._begin(self._rows(iteration) if iteration > 0 else [])
+        self._replace(iteration)
 
-    def _rows(self, last: float = math.inf) -> list[dict[str, str]]:
-        """Up to an iteration. A crash may leave rows of later ones, and half of a line."""
-        if not self.path.is_file():
-            return []
-        with self.path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            self.columns = list(reader.fieldnames or COLUMNS)
-            return [row for row in reader if None not in row.values() and int(row["iteration"]) <= last]
+    def write(self, row: Mapping[str, float]) -> None:
+        new = [name for name in row if name not in self.columns]
+        if new or not self.path.is_file():  # someone may have moved it
+            self._replace(math.inf, new)
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, self.columns, restval="").writerow(row)
 
-    def _begin(self, rows: list[dict[str, str]]) -> None:
-        """Replace the file in one step, and go on at its end."""
+    def _replace(self, last: float, new: Sequence[str] = ()) -> None:
+        """Replace the file in one step: its rows up to an iteration, with new columns.
+
+        A crash may have left rows of later iterations, and half of a line.
+        """
+        rows = list[dict[str, str]]()
+        if last > 0 and self.path.is_file():
+            with self.path.open(newline="") as file:
+                reader = csv.DictReader(file)
+                self.columns = list(reader.fieldnames or COLUMNS)
+                rows = [row for row in reader if None not in row.values() and int(row["iteration"]) <= last]
+        self.columns += new
         temporary = self.path.with_suffix(".csv.tmp")
         with temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self.columns, restval="")
             writer.writeheader()
             writer.writerows(rows)
         os.replace(temporary, self.path)
-        self._file = self.path.open("a", newline="")
-
-    def write(self, row: Mapping[str, float]) -> None:
-        if new := [name for name in row if name not in self.columns]:
-            self._file.close()
-            rows = self._rows()
-            self.columns += new
-            self._begin(rows)
-        csv.DictWriter(self._file, self.columns, restval="").writerow(row)
-        self._file.flush()
-
-    def close(self) -> None:
-        self._file.close()
 
 
 def column(scalar: str) -> str:
@@ -124,7 +145,8 @@ SCREEN = Screen()
 
 
 def say(text: object) -> None:
-    SCREEN.write(f"{text}\n")
+    """Print a line, above the progress bar if there is one."""
+    tqdm.write(str(text), file=SCREEN)
 
 
 class ProgressLog:
@@ -155,14 +177,7 @@ class ProgressLog:
         if "charts/episodic_return" in scalars:
             self.bar.set_postfix_str(f"return {scalars['charts/episodic_return']:.1f}", refresh=False)
 
-    def message(self, text: str) -> None:
-        if not self.quiet:
-            tqdm.write(text, file=SCREEN)
-
     def close(self) -> None:
         if self.bar is not None:
             self.bar.close()
-        try:
-            self.tensorboard.close()
-        finally:
-            self.file.close()
+        self.tensorboard.close()

@@ -12,9 +12,7 @@ from diffsim.training import graph
 
 
 def choose_device(device: str) -> str:
-    """The device of this process: with "auto" a GPU if there is one; of several ranks each takes its own GPU."""
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    """The device of this process: of several ranks each takes its own GPU."""
     return f"cuda:{os.environ['LOCAL_RANK']}" if device == "cuda" and "LOCAL_RANK" in os.environ else device
 
 
@@ -47,13 +45,6 @@ def average(tensor: torch.Tensor) -> torch.Tensor:
         dist.all_reduce(tensor)
         tensor /= dist.get_world_size()
     return tensor
-
-
-def stack(tensor: torch.Tensor) -> torch.Tensor:
-    """The tensors of all ranks (ranks, ...); it does not wait for the device and can be captured."""
-    every = tensor.new_zeros(size(), *tensor.shape)
-    every[rank()] = tensor
-    return average(every) * size()
 
 
 def gather(value: Any) -> list[Any]:

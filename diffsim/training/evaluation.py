@@ -6,10 +6,9 @@ import copy
 import dataclasses
 import json
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -22,14 +21,11 @@ import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.training import checkpoint, graph
-from diffsim.training.checkpoint import SavedPolicy
 from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
 
-FILM = "diffsim.extra.render:film"
 GAIT = "diffsim.extra.gait:report"
-VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit
 ENOUGH = 0.97  # share of the return that must survive
@@ -48,7 +44,7 @@ class Evaluation:
     speed: float | None  # mean forward speed, m/s; None for a robot that does not travel
     qpos: Tensor  # (T, n, nq) before each step; valid up to an episode's length
     action: Tensor  # (T, n, nu) of each step
-    scene: Scene  # to draw the episodes; of several terrains episode i has number i % M
+    scene: Scene  # of the episodes; of several terrains episode i has number i % M
     control_dt: float  # s
     others: dict[str, float] = field(default_factory=dict)  # what else a script measured, by name
     ghost: Tensor | None = None  # (T, n, nq) what was to be tracked, before each step; see Task.ghost
@@ -69,21 +65,6 @@ class Evaluation:
         others = "".join(f", {name.replace('_', ' ')} {value:.2f}" for name, value in self.others.items())
         return f"return median {r.median():.1f}, {spread}, length {self.length:.1f}{speed}{others}"
 
-    def write_json(self, path: Path, settings: Mapping[str, Any], **found: Any) -> None:
-        """Write the scalars, each episode's return and length, what they were measured with, what else was found."""
-        values = {
-            "return": self.returns.median().item(),
-            "length": self.length,
-            "speed": self.speed,
-            **self.others,
-            **found,
-            "returns": self.returns.tolist(),
-            "lengths": self.lengths.tolist(),
-            "settings": dict(settings),
-        }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(values, indent=2, default=str) + "\n")
-
     @property
     def median(self) -> int:
         """The episode of median return."""
@@ -93,22 +74,6 @@ class Evaluation:
         """qpos (T, nq) and action (T, nu) of all steps of an episode."""
         steps = int(self.lengths[number])
         return self.qpos[:steps, number].numpy(force=True), self.action[:steps, number].numpy(force=True)
-
-    def save_video(self, path: Path, seconds: float = VIDEO_SECONDS, **options: Any) -> Path:
-        """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
-
-        options: of render.film, such as size (width, height) in pixels.
-
-        Raises:
-            OSError, RuntimeError: what is missing to draw or to write, see render.film.
-        """
-        steps, scene = max(1, round(seconds / self.control_dt)), self.scene
-        qpos, action = (rows[:steps] for rows in self.episode(self.median))
-        ghost = None if self.ghost is None else self.ghost[:, self.median].numpy(force=True)
-        if scene.terrain is not None:
-            scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])
-        film = pkgutil.resolve_name(FILM)  # a run without a video loads no OpenGL
-        return film(path, scene, qpos, self.control_dt, action, ghost=ghost, **options)
 
 
 def kept(own: float, finer: float) -> float:
@@ -203,18 +168,6 @@ def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, see
         fail(error)
 
 
-def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **changes: Any) -> DiffEnv:
-    """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags.
-
-    Of a task of your own, env is its file.
-    """
-    changes |= {"env": saved.task(changes.get("env"))}
-    args = SimpleNamespace(**vars(Flags()) | saved.args | {"device": "cpu", "threads": 0} | changes)
-    env = make_env(args, num_envs, forces=forces)
-    fitting(saved.network, env)
-    return env
-
-
 def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | None = None) -> None:
     """Do what --evaluate asks for: print the evaluation of a saved policy, and write evaluation.json.
 
@@ -235,6 +188,7 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
         return restored.evaluate()
 
     evaluation = measure(args)
+    pkgutil.resolve_name(checkpoint.PROVENANCE).compare(state.get("robot"), evaluation.scene)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     write_evaluation(args, evaluation, state["iteration"], **compare_finer(args, evaluation, measure))
 
@@ -261,9 +215,13 @@ def compare_finer(args: Args, evaluation: Evaluation, measure: Callable[[Args], 
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
-    """Write evaluation.json to the run's directory; print and write how the robot walks."""
+    """Write evaluation.json to the run's directory, with what else was found; print and write how the robot walks."""
     assert args.run_dir
+    values: dict[str, Any] = dict.fromkeys(("return", "length", "speed"))
+    values |= {name.removeprefix("eval/"): value for name, value in evaluation.scalars().items()}
+    values |= found | {"returns": evaluation.returns.tolist(), "lengths": evaluation.lengths.tolist()}
     settings = {name: value for name, value in vars(args).items() if name in SETTINGS}
-    settings |= dict(script=args.script(), iteration=iteration)
-    evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
+    values["settings"] = settings | {"script": args.script(), "iteration": iteration}
+    args.run_dir.mkdir(parents=True, exist_ok=True)
+    (args.run_dir / "evaluation.json").write_text(json.dumps(values, indent=2) + "\n")
     pkgutil.resolve_name(GAIT)(evaluation, args.run_dir)

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+import torch
 import tyro
 
 from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
-from diffsim.training import checkpoint, distributed
+from diffsim.training import checkpoint
 from diffsim.training.errors import fail, in_one_line
 from diffsim.training.ranges import Count, Natural, Range, check_ranges, flag
 
@@ -32,6 +33,7 @@ class Flags:
     """Flags of every script: the run, the task, and how it is simulated. Each script adds its hyperparameters."""
 
     fixed: ClassVar[tuple[str, ...]] = ()  # flags of a script that --resume keeps
+    processes: ClassVar[bool] = True  # whether torchrun may split its environments among several
 
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
     seed: Seed = 1
@@ -52,8 +54,6 @@ class Flags:
     """checkpoint, or directory of a run, to continue with its arguments unless the command line gives others"""
     evaluate: Path | None = None
     """checkpoint, or directory of a run, to evaluate, e.g. with more --substeps; writes evaluation.json to --run-dir"""
-    track: bool = False
-    """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
     """no progress bar, and no messages until the end"""
     contact: Contact = "soft"
@@ -80,8 +80,6 @@ class Flags:
         """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""
         if self.contact == "mujoco" and self.implicit:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
-        if (num_envs := getattr(self, "num_envs", 0)) % distributed.size():
-            fail(f"--num-envs {num_envs} cannot be split evenly among {distributed.size()} processes")
         if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
 
@@ -172,8 +170,6 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     if args.resume:
         if saved["iteration"] >= args.iterations:
             fail(f"{path} is at iteration {saved['iteration']} already: give more --iterations")
-        if (ranks := len(saved["ranks"])) != distributed.size():
-            fail(f"{path} was trained by {ranks} processes, not {distributed.size()}")
         if args.device.partition(":")[0] != defaults.device.partition(":")[0]:
             fail(f"{path} was trained on {defaults.device}, which {args.device} cannot continue exactly")
     return args
@@ -183,7 +179,8 @@ def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
     with in_one_line(argv):
         about = sys.modules[kind.__module__].__doc__
         args = tyro.cli(kind, prog=Path(sys.argv[0]).name, args=argv, default=defaults, description=about)
-    args.device = distributed.choose_device(args.device)
+    if args.device == "auto":
+        args.device = "cuda" if torch.cuda.is_available() else "cpu"
     for name in ("resume", "evaluate"):
         if (path := getattr(args, name)) and path.is_dir():
             setattr(args, name, path / "checkpoint.pt")

@@ -67,7 +67,11 @@ class ClippedAdam:
         """
         if not loss.requires_grad:
             fail("the loss has no gradient: observe and reward must be torch operations, without detach and no_grad")
-        return distributed.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
+        return self.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
+
+    def average(self, tensor: Tensor) -> Tensor:
+        """Average what each rank measured on its samples over the ranks, in place."""
+        return distributed.average(tensor)
 
     def step(self, gradient: Tensor) -> Tensor:
         """Take one descent step; returns the gradient's norm () before clipping."""
@@ -101,8 +105,6 @@ class ClippedAdam:
         own, saved = self._state(), state["adam"][0]
         if {name: value.shape for name, value in saved.items()} != {name: value.shape for name, value in own.items()}:
             raise ValueError("the state of an optimizer")
-        if not bool(state["skipped"].isfinite()):
-            raise ValueError("the count of skipped updates")
         for name, value in own.items():
             value.copy_(saved[name])
         self.lr.copy_(state["lr"])

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TextIO, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,7 @@ from diffsim.sim.options import check_device
 from diffsim.tasks import FILE, find_task
 from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
-from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, make_unused, say
+from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, lock, make_unused, say
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, Player, compare_finer, make_env, write_evaluation
 from diffsim.training.flags import Flags
@@ -77,12 +77,18 @@ class Run:
 
     def __init__(self, args: Flags) -> None:
         self.args = args
-        self.writes = distributed.rank() == 0
-        self._state = checkpoint.load(args.resume, args.script()) if args.resume else None
+        self.writes, processes = distributed.rank() == 0, distributed.size()
+        self._lock: TextIO | None = None
+        if processes > 1 and not args.processes:
+            fail("this learner trains in one process: start it without torchrun")
         if self.writes:
             self._check_directory()
+        self._state = checkpoint.load(args.resume, args.script()) if args.resume else None
+        if self._state and (ranks := len(self._state["ranks"])) != processes:
+            fail(f"{args.resume} was trained by {ranks} processes, not {processes}")
         if torch.get_default_dtype() != torch.float32:
             fail(f"training computes in float32: torch's default dtype must be that, not {torch.get_default_dtype()}")
+        args.device = distributed.choose_device(args.device)
         try:
             self.device = check_device(args.device)
         except ValueError as error:
@@ -117,10 +123,12 @@ class Run:
     def make_env(self, num_envs: int, horizon: int, **options: Any) -> DiffEnv:
         """This rank's share of the training environments, with its own random start states, and options of DiffEnv."""
         self._samples = num_envs * horizon
-        args, size = self.args, num_envs // distributed.size()
+        args, processes = self.args, distributed.size()
+        if num_envs % processes:
+            fail(f"--num-envs {num_envs} cannot be split evenly among {processes} processes")
         seed = args.seed + distributed.rank() * RANK_SEED
         varied_by = find_task(args.env).varied_by
-        self._env = make_env(args, size, horizon, seed, factors=varied_by is not None, **options)
+        self._env = make_env(args, num_envs // processes, horizon, seed, factors=varied_by is not None, **options)
         if varied_by is not None:
             self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
         return self._env
@@ -132,13 +140,15 @@ class Run:
 
     @cached_property
     def directory(self) -> Path:
-        """Made when it is first needed, so that a run that fails at its start leaves nothing behind."""
+        """Made and locked when it is first needed: a run that fails at its start leaves nothing behind."""
         args = self.args
         with self._writing():
             if args.run_dir is None:
                 name = f"{find_task(args.env).name}__{args.script()}__{args.seed}__{int(time.time())}"
                 args.run_dir = make_unused(RUNS / name)
             args.run_dir.mkdir(parents=True, exist_ok=True)
+            self._lock = self._lock or lock(args.run_dir)
+        self._check_unused(args.run_dir)  # again: a run may have ended there since this one started
         return args.run_dir
 
     def restore(self, learner: L) -> L:
@@ -159,6 +169,10 @@ class Run:
             if state["args"]["env"] != self.args.env and not FILE.fullmatch(self.args.env):
                 episodes = None  # which stand on another clip's frames or on other ground: new ones begin
             checkpoint.restore(learner, state, episodes)
+            if self.writes:
+                pkgutil.resolve_name(checkpoint.PROVENANCE).compare(
+                    state.get("robot"), (self._env or self.eval_env).scene
+                )
             self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]
@@ -249,10 +263,8 @@ class Run:
         self.message(f"iteration {self.iteration}: {evaluation}")
 
     def message(self, text: str) -> None:
-        """Print a line above the progress bar, unless --quiet."""
-        if self._log is not None:
-            self._log.message(text)
-        elif self.writes and not self.args.quiet:
+        """Print a line, unless --quiet."""
+        if self.writes and not self.args.quiet:
             say(text)
 
     def _end_iteration(self) -> None:
@@ -303,14 +315,14 @@ class Run:
         """That a run can be written there; leaves nothing behind."""
         args, path = self.args, self.args.run_dir or RUNS
         check_writable(path)
-        existing = path / "checkpoint.pt"
-        if existing.exists() and (args.resume is None or not args.resume.samefile(existing)):
+        self._check_unused(path)
+        if args.resume and path.is_dir():
+            self._lock = lock(path)  # before its checkpoint is read
+
+    def _check_unused(self, path: Path) -> None:
+        existing, resumed = path / "checkpoint.pt", self.args.resume
+        if existing.exists() and (resumed is None or not resumed.samefile(existing)):
             fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
-        if args.track:
-            try:
-                import wandb  # noqa: F401
-            except ImportError:
-                fail("--track needs Weights & Biases: pip install wandb")
 
     def _open(self) -> None:
         """Begin to write and to receive signals, once."""
@@ -326,11 +338,6 @@ class Run:
         arguments = dataclasses.asdict(args)
         with self._writing():
             (directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
-            if args.track:
-                import wandb
-
-                options = dict(name=directory.name, dir=directory, config=arguments, sync_tensorboard=True)
-                wandb.init(project="diffsim", **options)
             start = directory, self.iteration, self.control_steps
             self._log = ProgressLog(*start, arguments, args.iterations, args.quiet)
 
@@ -386,6 +393,7 @@ class Run:
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
         state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
         state |= dict(simulator=self.simulator, task=find_task(self.args.env).stored())
+        state |= dict(robot=pkgutil.resolve_name(checkpoint.PROVENANCE).fingerprint((self._env or self.eval_env).scene))
         with self._writing():
             checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
         self._saved = self.iteration
@@ -396,6 +404,8 @@ class Run:
         if self._log is not None:
             with suppress(OSError) if sys.exc_info()[0] else self._writing():  # one message is enough
                 self._log.close()
+        if self._lock is not None:
+            self._lock.close()
         distributed.finalize()
 
     def _summarise(self) -> None:

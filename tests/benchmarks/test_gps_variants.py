@@ -19,6 +19,7 @@ import diffsim
 from diffsim.extra import render
 from diffsim.extra.planning import save_demonstration
 from diffsim.extra.terrain import incline, rough
+from diffsim.extra.watch import film_median
 from diffsim.sim.elevation import Elevation
 from diffsim.training import parse
 
@@ -167,7 +168,7 @@ def test_a_search_on_several_terrains(tmp_path: Path, slopes: Path, monkeypatch:
     films: list[Any] = []
     monkeypatch.setattr(render, "film", lambda path, scene, *_, **__: films.append(scene.terrain))
     evaluation.returns = torch.tensor([1.0, 0.0])  # of two, the worse one is filmed
-    evaluation.save_video(tmp_path / "video.mp4")
+    film_median(evaluation, tmp_path / "video.mp4")
     np.testing.assert_allclose(films[-1][0, :3], named_terrains(SLOPES[1])[0])
 
 

@@ -14,7 +14,8 @@ from learners import refusal
 from tables import read_csv
 
 import diffsim
-from diffsim.training import load_policy, make_policy_env
+from diffsim.extra.watch import make_policy_env
+from diffsim.training import load_policy
 
 pytest.importorskip("mujoco_warp")
 

@@ -15,11 +15,12 @@ import diffsim
 import shac
 from diffsim import tasks
 from diffsim.extra import commands as command
+from diffsim.extra.learning.likeliest import Likeliest
 from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.tracking import G1Track
 from diffsim.extra.robots.joystick import Go1
 from diffsim.tasks.base import ASSETS
-from diffsim.training import Likeliest, ObsNormalizer, load_policy, parse
+from diffsim.training import ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
 
 STATE: dict[str, Any] = {"args": {"env": "cartpole"}, "iteration": 1}
@@ -113,6 +114,16 @@ def test_an_exported_policy_holds_a_clip_that_is_not_shipped_and_may_have_16_bit
         wanted = policy[0].weight.half().float() if half else policy[0].weight
         assert torch.equal(saved.network[0].weight, wanted)
     assert sizes[0] - sizes[1] == pytest.approx(2 * (224 + 1) * 29, abs=200)
+
+
+def test_weights_that_16_bits_cannot_hold_are_refused(tiny_run: Path, tmp_path: Path, capsys) -> None:
+    state = torch.load(tiny_run / "checkpoint.pt")
+    state["policy"]["weights"]["1.bias"][0] = 1e5
+    torch.save(state, path := tmp_path / "checkpoint.pt")
+    words = ["export", str(path), str(tmp_path / "policy.pt")]
+    error = refusal(lambda: command.main([*words, "--half"]), capsys)
+    assert error.endswith("weight 1.bias of the policy is too large for 16 bits") and [*tmp_path.iterdir()] == [path]
+    command.main(words)
 
 
 @pytest.mark.parametrize("symmetric", [False, True])

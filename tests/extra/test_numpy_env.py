@@ -12,6 +12,7 @@ import pytest
 import torch
 from gymnasium import wrappers
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import diffsim
 from diffsim.extra.numpy_env import NumpyEnv, NumpyVectorEnv
@@ -117,13 +118,30 @@ def test_a_batch_is_the_tensors_batch_in_arrays() -> None:
         for array, tensor in zip(arrays, tensors, strict=True):
             assert type(array) is np.ndarray
             np.testing.assert_array_equal(array, tensor)
-        assert info.keys() == expected.keys() and info["episode"].keys() == expected["episode"].keys()
-        for name in info.keys() - {"episode"}:
+        assert info.keys() == expected.keys() - {"episode", "_episode"}
+        for name in info:
             np.testing.assert_array_equal(info[name], expected[name])
-        np.testing.assert_array_equal(info["episode"]["r"], expected["episode"]["r"])
         ends += arrays[2].sum()
         arrays[0][:], info["final_obs"][:] = 0, 0
     assert ends > 2
+
+
+def test_gymnasium_records_the_statistics_of_episodes() -> None:
+    env = RecordEpisodeStatistics(gymnasium.make_vec(HOPPERS, num_envs=4, max_episode_steps=40))
+    plain, ended = diffsim.make("hopper", num_envs=4, horizon=1, max_episode_steps=40), 0
+    env.reset(seed=3)
+    plain.reset(seed=3)
+    for action in random_actions(100, 4, 3):
+        action[:2] = 1.0  # which makes them fall
+        info = env.step(action)[-1]
+        with torch.no_grad():
+            expected = plain.step(torch.from_numpy(action))[-1]
+        done = expected["_episode"].numpy()
+        np.testing.assert_array_equal(info.get("_episode", np.zeros(4, bool)), done)
+        for name in "rl" if done.any() else "":
+            np.testing.assert_allclose(info["episode"][name][done], expected["episode"][name][done], rtol=1e-5)
+        ended += done.sum()
+    assert ended > 6 and env.episode_count == ended
 
 
 def test_actions_of_other_types_and_seeds() -> None:

@@ -1,4 +1,4 @@
-"""One of several ranks, which trains every script in turn; test_distributed.py has torchrun start them.
+"""One of several ranks, which trains scripts in turn; test_distributed.py has torchrun start them.
 
 In SHAC's case each rank takes its share of the noise and the start states that one process alone would draw.
 """
@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 import bptt
-import pfpn
 import ppo_baseline
 import sapo
 import shac
@@ -51,7 +50,7 @@ def restore(run: Run, learner: Learner, restore: Callable[[Run, Learner], Learne
 def main(directory: str, *setting: str) -> None:
     Run.restore = restore
     finalize, distributed.finalize = distributed.finalize, lambda: None  # the ranks stay connected until the last one
-    for script in (bptt, pfpn, ppo_baseline, sapo, shac):
+    for script in (bptt, ppo_baseline, sapo, shac):
         if script is shac:
             shac.Actor.sample_noise, DiffEnv._uniform, distributed.finalize = sample_noise, uniform, finalize
         rank, path = distributed.rank(), Path(directory) / script.__name__

@@ -9,13 +9,12 @@ import pytest
 from learners import read_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from diffsim.training import UsageError
 from diffsim.training.directory import (
     COLUMNS,
     EpisodeStatistics,
     ProgressFile,
     ProgressLog,
-    check_writable,
+    say,
 )
 
 
@@ -29,14 +28,10 @@ def test_columns_join_when_they_first_have_a_value(tmp_path: Path) -> None:
     assert path.read_text().split() == [",".join(COLUMNS)]
     file.write(row(1, loss=0.25))
     file.write(row(2, loss=0.5))
-    assert [r["loss"] for r in read_progress(tmp_path)] == [
-        "0.25",
-        "0.5",
-    ]  # can be read without a close
+    assert [r["loss"] for r in read_progress(tmp_path)] == ["0.25", "0.5"]
     file.write(row(3, eval=7.0, loss=0.75))
     file.write(row(4, loss=1.0))
     file.write(row(5, eval=8.0))
-    file.close()
     assert list(read_progress(tmp_path)[0]) == [*COLUMNS, "loss", "eval"]
     assert [r["loss"] for r in read_progress(tmp_path)] == ["0.25", "0.5", "0.75", "1.0", ""]
     assert [r["eval"] for r in read_progress(tmp_path)] == ["", "", "7.0", "", "8.0"]
@@ -50,21 +45,19 @@ def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path: Path) -> None:
     file = ProgressFile(path, 0)
     for k in range(1, 11):
         file.write(row(k, loss=float(k)) | ({"eval": 1.0} if k == 9 else {}))
-    file.close()
     with path.open("a") as text:
         text.write("1")  # of 11,110,...
     file = ProgressFile(path, 6)
     file.write(row(7, loss=-7.0))
     file.write(row(8, loss=-8.0, speed=2.0))
-    file.close()
     rows = read_progress(tmp_path)
     assert [r["iteration"] for r in rows] == [str(k) for k in range(1, 9)]
     assert [r["loss"] for r in rows] == [f"{k}.0" for k in range(1, 7)] + ["-7.0", "-8.0"]
     assert [r["speed"] for r in rows] == [""] * 7 + ["2.0"] and not any(r["eval"] for r in rows)
-    ProgressFile(path, 0).close()  # another run, from the start
+    ProgressFile(path, 0)  # another run, from the start
     assert read_progress(tmp_path) == []
     path.unlink()
-    ProgressFile(path, 6).close()  # resumed where only the checkpoint was kept
+    ProgressFile(path, 6)  # resumed where only the checkpoint was kept
     assert read_progress(tmp_path) == []
 
 
@@ -103,7 +96,7 @@ def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: py
     log = ProgressLog(tmp_path, 0, 0, {"gamma": 0.99, "hidden": (64, 64)}, total=4, quiet=False)
     for k in range(1, 4):
         log.write(k, 10 * k, 0.12345 * k, {"losses/actor": 1 / 3, "charts/episodic_return": 12.34})
-    log.message("a line")
+    say("a line")
     log.close()
     rows = read_progress(tmp_path)
     assert [r["control_steps"] for r in rows] == ["10", "20", "30"]
@@ -126,8 +119,3 @@ def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: py
     ]
     (text,) = events.Tensors("hyperparameters/text_summary")[:1]
     assert text.tensor_proto.string_val[0].decode() == "|name|value|\n|-|-|\n|gamma|0.99|\n|hidden|(64, 64)|"
-
-
-def test_a_name_that_is_no_text_is_refused() -> None:
-    with pytest.raises(UsageError, match="cannot write to run directory .*: its name is not UTF-8"):
-        check_writable(Path("bad\udcff"))

@@ -11,8 +11,14 @@ from typing import Any
 import pytest
 import ranks
 import torch
-from learners import PATH, SCRIPTS, assert_same, refusal, run
+from learners import PATH, assert_same, refusal, run
 
+import gps
+import mbpo
+import pfpn
+import pfpn_sac
+import pods
+import sac_baseline
 import shac
 from diffsim.env import DiffEnv
 
@@ -29,7 +35,7 @@ def load(path: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory):
-    """Of the runs of two ranks."""
+    """The runs of two ranks."""
     directory = tmp_path_factory.mktemp("ranks")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", ranks.__file__]
     subprocess.run([*command, str(directory), *SETTING], env=os.environ | PATH, check=True, timeout=300)
@@ -48,7 +54,7 @@ def test_two_ranks_of_half_the_environments_are_one_of_all(directory, tmp_path, 
     assert count == 4 and length == 4 * 240
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("name", ["bptt", "ppo_baseline", "sapo", "shac"])
 def test_ranks_share_weights_and_statistics_and_have_states_of_their_own(directory, name):
     first, second = (load(directory / f"{name}.{rank}.pt") for rank in range(2))
     checkpoint = load(directory / name / "checkpoint.pt")
@@ -73,3 +79,12 @@ def test_as_many_processes_resume_as_were_saved(directory, capsys, monkeypatch):
     with pytest.raises(SystemExit) as exit:
         shac.main(["--env", "cartpole", "--num-envs", "4"])
     assert exit.value.code == 2 and capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("script", [gps, mbpo, pfpn, pfpn_sac, pods, sac_baseline], ids=lambda script: script.__name__)
+def test_other_learners_refuse_torchrun(script, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    call = ["--env", "cartpole", "--device", "cpu", "--run-dir", str(tmp_path / "run")]
+    line = refusal(lambda: script.main(call), capsys)
+    assert line == "script.py: this learner trains in one process: start it without torchrun"
+    assert not list(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from torch import nn
 import diffsim
 import shac
 from diffsim.extra import render
+from diffsim.extra.watch import film_median
 from diffsim.training import Evaluation, evaluate, evaluation
 
 
@@ -81,15 +83,18 @@ def test_numbers_of_an_evaluation(result: Evaluation, tmp_path: Path) -> None:
     five = some(result)
     assert five.scalars() == {"eval/return": 3.0, "eval/length": 5.0, "eval/speed": 1.25}
     assert str(five) == ("return median 3.0, mean 22.0, std 39.0, min 1.0, length 5.0, forward speed 1.25 m/s")
-    path = tmp_path / "new" / "evaluation.json"
-    five.write_json(path, {"env": "ant", "substeps": 16, "penalty": ("mu=1",), "run_dir": tmp_path})
-    assert json.loads(path.read_text()) == {
+    args = shac.Args(env="cartpole", device="cpu", run_dir=tmp_path / "new")
+    evaluation.write_evaluation(args, dataclasses.replace(five, speed=None), 7, finer=0.5)
+    written = json.loads((tmp_path / "new" / "evaluation.json").read_text())
+    settings = {"env": "cartpole", "device": "cpu", "substeps": 16, "script": "shac", "iteration": 7}
+    assert written.pop("settings").items() > settings.items()
+    assert written == {
         "return": 3.0,
         "length": 5.0,
-        "speed": 1.25,
+        "speed": None,
+        "finer": 0.5,
         "returns": [4.0, 1.0, 3.0, 100.0, 2.0],
         "lengths": [5, 2, 7, 10, 1],
-        "settings": {"env": "ant", "substeps": 16, "penalty": ["mu=1"], "run_dir": str(tmp_path)},
     }
 
 
@@ -103,12 +108,12 @@ def test_the_video_is_of_the_median_episode(
         return path
 
     monkeypatch.setattr(render, "film", film)
-    assert some(result).save_video(tmp_path / "video.mp4") == tmp_path / "video.mp4"
+    assert film_median(some(result), tmp_path / "video.mp4") == tmp_path / "video.mp4"
     ((scene, qpos, dt, ctrl),) = filmed
     assert scene is result.scene and dt == 1 / 60
     np.testing.assert_array_equal(qpos[:, 0], range(7))  # seven steps of the episode of return 3
     np.testing.assert_allclose(ctrl[:, 0], np.arange(7) / 10, rtol=1e-6)
-    some(result, control_dt=2.0).save_video(tmp_path / "video.mp4")
+    film_median(some(result, control_dt=2.0), tmp_path / "video.mp4")
     assert len(filmed[1][1]) == 5  # ten seconds
 
 

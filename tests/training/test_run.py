@@ -5,21 +5,24 @@ from __future__ import annotations
 import errno
 import json
 import math
+import os
 import re
 import runpy
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from learners import ROOT, SMALL, assert_same, read_progress, refusal, run, stopped
+from learners import PATH, ROOT, SMALL, assert_same, read_progress, refusal, run, stopped
 from torch import Tensor, nn
 
 import bptt
@@ -28,7 +31,7 @@ import shac
 from diffsim.env import DiffEnv
 from diffsim.tasks import REGISTERED
 from diffsim.tasks.cartpole import CartPole
-from diffsim.training import ClippedAdam, Run, checkpoint, evaluate, load_policy, parse
+from diffsim.training import ClippedAdam, Run, checkpoint, evaluate, fail, load_policy, parse
 from diffsim.training.directory import COLUMNS
 
 # Iterations of a few milliseconds.
@@ -164,7 +167,8 @@ def test_a_directory_that_is_moved_is_made_again(tmp_path, monkeypatch):
     original = bptt.bptt_loss
     monkeypatch.setattr(bptt, "bptt_loss", moved)
     assert run(bptt, tmp_path / "run", *TINY, "--iterations", 3, "--eval-every", 1, "--quiet")["iteration"] == 3
-    assert len(read_progress(tmp_path / "moved")) == 3
+    assert [row["iteration"] for row in read_progress(tmp_path / "moved")] == ["1"]
+    assert [row["iteration"] for row in read_progress(tmp_path / "run")] == ["2", "3"]
 
 
 @pytest.mark.parametrize("part", ["reward", "observation 2"])
@@ -191,19 +195,17 @@ def test_the_first_number_of_a_task_that_is_none_is_named(part, tmp_path, monkey
     assert error == f"script.py: iteration {first}: {name} of faulty is not finite; no checkpoint was saved"
 
 
-def test_another_default_dtype_is_refused(tmp_path, capsys):
-    torch.set_default_dtype(torch.bfloat16)
-    try:
-        error = refusal(lambda: bptt.main([*TINY, "--run-dir", str(tmp_path)]), capsys)
-    finally:
-        torch.set_default_dtype(torch.float32)
-    assert error.endswith("float32: torch's default dtype must be that, not torch.bfloat16")
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no limit")
-@pytest.mark.parametrize(("limit", "arguments"), [(30_000, "--save-every 1"), (1_000, "--save-every 0")])
-def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, tmp_path, capsys):
-    """What does not fit is the checkpoint, or the progress."""
+@pytest.mark.parametrize(
+    ("limit", "arguments", "message"),
+    [
+        (30_000, "--save-every 1", "to {}: File too large; {}/checkpoint.pt is of iteration 2"),
+        (1_000, "--save-every 0", "to {}: File too large; {}/checkpoint.pt is of iteration 2"),
+        (10, "--save-every 0", "to run directory {}: File too large"),
+    ],
+)
+def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, message, tmp_path, capsys):
+    """What does not fit is the checkpoint, or the progress, or anything at all."""
     import resource
 
     run(bptt, tmp_path, *TINY, "--iterations", 50, "--quiet", stop_after=2)
@@ -218,8 +220,76 @@ def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, tmp_path, caps
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
     error = refusal(resume, capsys)
-    assert error == f"script.py: cannot write to {tmp_path}: File too large; {path} is of iteration 2"
+    assert error == f"script.py: cannot write {message.format(tmp_path, tmp_path)}"
     assert path.read_bytes() == whole and not list(tmp_path.glob("*.tmp"))
+
+
+def process(script: str, *arguments: object) -> subprocess.Popen[str]:
+    command = [sys.executable, ROOT / f"{script}.py", *map(str, arguments)]
+    return subprocess.Popen(command, text=True, stderr=subprocess.PIPE, env=os.environ | PATH)
+
+
+def is_free(directory: Path) -> bool:
+    """Whether another process could lock a run's directory."""
+    program = "import fcntl, sys; fcntl.lockf(open(sys.argv[1], 'a'), fcntl.LOCK_EX | fcntl.LOCK_NB)"
+    return subprocess.run([sys.executable, "-c", program, directory / "lock"], capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+def test_a_directory_belongs_to_one_process(tmp_path, capsys):
+    """Of two that start at once and of one that resumes the other; a killed one leaves it free."""
+    arguments = *TINY, "--iterations", 10**6, "--eval-every", 0, "--save-every", 1, "--quiet", "--run-dir", tmp_path
+    both = [process("bptt", *arguments, "--seed", seed) for seed in (1, 2)]
+    try:
+        while all(each.poll() is None for each in both) or not (tmp_path / "checkpoint.pt").exists():
+            assert any(each.poll() is None for each in both)
+            time.sleep(0.05)
+        second, first = sorted(both, key=lambda each: each.poll() is None)
+        *_, error = second.stderr.read().splitlines()
+        holder = f"{tmp_path} is in use by process {first.pid} on {socket.gethostname()}: wait for its end, or choose"
+        assert second.wait() == 2 and error.startswith(f"bptt.py: {holder} another --run-dir")
+        for resumed in (tmp_path, tmp_path / "checkpoint.pt"):
+            assert holder in refusal(lambda path=resumed: bptt.main(["--resume", str(path)]), capsys)
+        assert first.poll() is None and not is_free(tmp_path)
+    finally:
+        for each in both:
+            each.kill()
+            each.wait()
+            each.stderr.close()
+    saved = checkpoint.load(tmp_path)["iteration"]
+    assert 0 <= len(read_progress(tmp_path)) - saved <= 1  # none is missing
+    run(bptt, tmp_path, "--resume", tmp_path / "checkpoint.pt", stop_after=saved + 2)
+    assert checkpoint.load(tmp_path)["iteration"] == saved + 2 == len(read_progress(tmp_path))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+@pytest.mark.parametrize("end", ["last", "signal", "error", "start"])
+def test_a_directory_is_free_when_its_run_has_ended(end, tmp_path, monkeypatch, capsys):
+    original, held = bptt.bptt_loss, []
+
+    def loss(*arguments: Any) -> Tensor:
+        held.append(not is_free(tmp_path))
+        if end == "signal":
+            signal.raise_signal(signal.SIGTERM)
+        if end == "error":
+            raise FloatingPointError("a mistake")
+        return original(*arguments)
+
+    arguments = *TINY, "--iterations", 2, "--quiet"
+    run(bptt, tmp_path, *arguments, stop_after=1)
+    monkeypatch.setattr(bptt, "bptt_loss", loss)
+    if end == "start":
+        monkeypatch.setattr(bptt, "BPTT", lambda *_: fail("a mistake"))
+    with pytest.raises(SystemExit) if end != "last" else nullcontext():
+        bptt.main(["--resume", str(tmp_path)])
+    assert all(held) and len(held) == (0 if end == "start" else 1)
+    assert is_free(tmp_path)
+
+
+def test_a_lock_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    (tmp_path / "lock").mkdir()
+    error = refusal(lambda: bptt.main([*TINY, "--iterations", "2", "--run-dir", str(tmp_path)]), capsys)
+    assert error == f"script.py: cannot write to run directory {tmp_path}: Is a directory"
 
 
 # What it counts -------------------------------------------------------------------------------------------------------
@@ -332,21 +402,6 @@ def test_runs_without_a_directory_have_one_of_their_own(tmp_path, monkeypatch):
     name = "cartpole__bptt__1__1700000000"
     assert {path.name for path in Path("runs").iterdir()} == {name, f"{name}.2", f"{name}.3"}
     assert all(json.loads((path / "args.json").read_text())["run_dir"] == str(path) for path in Path("runs").iterdir())
-
-
-def test_track(tmp_path, monkeypatch, capsys):
-    calls = []
-    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **arguments: calls.append(arguments)))
-    run(bptt, tmp_path / "there", *TINY, "--iterations", 1, "--quiet", "--track")
-    (call,) = calls
-    assert (call["project"], call["name"], call["dir"]) == ("diffsim", "there", tmp_path / "there")
-    assert call["config"]["num_envs"] == 2 and call["sync_tensorboard"]
-
-    monkeypatch.setitem(sys.modules, "wandb", None)  # import fails
-    missing = tmp_path / "missing"
-    line = refusal(lambda: run(bptt, missing, *TINY, "--track"), capsys)
-    assert line == "script.py: --track needs Weights & Biases: pip install wandb"
-    assert not missing.exists()
 
 
 def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Compute the cost of trajectories and its positive semidefinite quadratic model: terms and their sum, see ilqr.Cost."""
+"""Compute the cost of trajectories and its positive semidefinite quadratic model; their sum is ilqr.Cost."""
 
 from __future__ import annotations
 

@@ -27,10 +27,11 @@ from diffsim.extra import commands as command
 from diffsim.extra.drive import serve as drive
 from diffsim.extra.drive.serve import Handler, Pilot, Server, Stage, Wish
 from diffsim.extra.terrain import step, uneven
+from diffsim.extra.watch import make_policy_env
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.ant import Ant
 from diffsim.tasks.base import ASSETS
-from diffsim.training import load_policy, make_policy_env
+from diffsim.training import load_policy
 
 PAGE = b"<p>the page</p><script>act()</script>"
 

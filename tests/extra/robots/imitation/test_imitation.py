@@ -19,7 +19,8 @@ from diffsim import tasks
 from diffsim.extra.export import export_policy
 from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.task import STRAY, HumanoidImitation
-from diffsim.training import checkpoint, load_policy, make_policy_env, parse
+from diffsim.extra.watch import make_policy_env
+from diffsim.training import checkpoint, load_policy, parse
 
 REAL = torch.float64
 NQ, NV, NU = 28, 27, 21

@@ -15,10 +15,11 @@ import diffsim
 import sapo
 import shac
 from diffsim.extra.mirror import Reflection
+from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_statistics
 from diffsim.tasks import TASKS
 from diffsim.training import ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
-from diffsim.training.layers import First, mirror_inputs, mirror_outputs
+from diffsim.training.layers import First
 
 MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1")
 LEARNERS = {
@@ -138,7 +139,7 @@ def test_statistics_are_those_of_observations_and_their_images() -> None:
     torch.manual_seed(0)
     mirror = TASKS["humanoid"]().mirror
     own, both = ObsNormalizer(76), ObsNormalizer(76)
-    own.mirror = mirror.obs
+    mirror_statistics(own, mirror.obs)
     for _ in range(3):
         obs = 3.0 * torch.randn(40, 76) + torch.randn(76)
         own.update(obs)
