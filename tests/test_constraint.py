@@ -35,7 +35,7 @@ import diffsim
 from diffsim.extra.gait import trace
 from diffsim.extra.terrain import incline
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import FACTORS
+from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -656,6 +656,10 @@ def test_frictionless_contact_and_friction_of_zero():
         _, qvel, _ = step(scene, states)
         np.testing.assert_allclose(qvel, in_mujoco(scene, *states)[1], atol=1e-9)
         assert qvel[0, 0] > 0.9999
+    with pytest.raises(
+        SceneError, match="robot: geom number 1: so little friction .* too stiff for float32; take condim"
+    ):
+        step(scene, states, dtype=torch.float32)
 
 
 def test_float32_keeps_the_zone_of_a_deep_contact(monkeypatch) -> None:
