@@ -35,7 +35,7 @@ import diffsim
 from diffsim.extra.gait import trace
 from diffsim.extra.terrain import incline
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import FACTORS
+from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -384,7 +384,8 @@ def test_tree_gradient_is_that_of_differences(base, seed, rng):
     assert in_mujoco(scene, *states)[2] == kinds_of_states(seed)
     check_gradients(scene, states, rng)
     if base in ("floating", "planar"):
-        check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (n, len(FACTORS)))})
+        few = [x[:16] for x in states]
+        check_gradients(scene, few, rng, {"factors": rng.uniform(0.7, 1.4, (16, len(FACTORS)))})
 
 
 @pytest.mark.parametrize("name", ["hopper", "sphere", *(pytest.param(name, marks=SLOW) for name in ("ant", "ball"))])
@@ -656,6 +657,10 @@ def test_frictionless_contact_and_friction_of_zero():
         _, qvel, _ = step(scene, states)
         np.testing.assert_allclose(qvel, in_mujoco(scene, *states)[1], atol=1e-9)
         assert qvel[0, 0] > 0.9999
+    with pytest.raises(
+        SceneError, match="robot: geom number 1: so little friction .* too stiff for float32; take condim"
+    ):
+        step(scene, states, dtype=torch.float32)
 
 
 def test_float32_keeps_the_zone_of_a_deep_contact(monkeypatch) -> None:

@@ -22,14 +22,18 @@ MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precisio
 LEAST_SOFTNESS = 1e-6  # of a pyramid's edges, at which Newton's method fails in single precision
 
 
-def constrained(scene: Scene, seconds: float) -> Scene:
-    """Return a copy with MuJoCo's constraints for that length of a substep; raises SceneError if unsupported."""
+def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
+    """Return a copy with MuJoCo's constraints for that length of a substep, to be solved in single precision or not.
+
+    Raises:
+        SceneError: a constraint is not supported, or too stiff for single precision.
+    """
     m = scene.mj_model
     if found := list(_obstacles(scene)):
         raise SceneError(f"{scene.name}: on MuJoCo's contact {'; '.join(found)}")
     fastest = 0.0 if "refsafe" in disabled_flags(m) else 2 * seconds
     ground = ground_pairs(m)[0][0] if len(scene.spheres.geom) else 0
-    contact = [_contact(scene, ground, geom, fastest) for geom in scene.spheres.geom.tolist()]
+    contact = [_contact(scene, ground, geom, fastest, single) for geom in scene.spheres.geom.tolist()]
     first = m.nv - scene.nlink + 1
     limit, loss = np.tile(_numbers((1.0, 1.0), (0.9, 0.9, 1.0, 0.5, 2.0), 1.0, 0.0), (scene.nlink, 1)), []
     for link, dof in enumerate(range(first, m.nv), start=1):
@@ -72,7 +76,7 @@ def check_soft(scene: Scene) -> None:
         )
 
 
-def _contact(scene: Scene, ground: int, geom: int, fastest: float) -> Array:
+def _contact(scene: Scene, ground: int, geom: int, fastest: float, single: bool) -> Array:
     m = scene.mj_model
     law = pair_law(m, ground, geom)
     weight = m.body_invweight0[m.geom_bodyid[[ground, geom]], 0].sum()
@@ -81,8 +85,11 @@ def _contact(scene: Scene, ground: int, geom: int, fastest: float) -> Array:
     numbers[2:4] = friction, 1 / m.opt.impratio
     name, end = f"{scene.name}: geom {label(m, mujoco.mjtObj.mjOBJ_GEOM, geom)}", numbers[5:7].max()
     edges = 2 * friction**2 * (1 + friction**2) / m.opt.impratio * (1 - end) / end
-    if m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and 0 < edges < LEAST_SOFTNESS:
-        raise SceneError(f"{name}: a pyramid of so little friction or large impratio is too stiff; take condim 1")
+    if single and m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and 0 < edges < LEAST_SOFTNESS:
+        raise SceneError(
+            f"{name}: so little friction or large impratio makes a pyramidal cone too stiff for float32; take condim 1 "
+            "or the elliptic cone"
+        )
     return _in_range(numbers, name)
 
 

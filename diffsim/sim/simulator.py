@@ -93,7 +93,7 @@ class Simulator:
         self._end_widths = scene.nq, scene.nv + hard  # with constraints a column for the residual
         check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
         if hard:
-            scene = constrained(scene, control_dt / how.substeps)
+            scene = constrained(scene, control_dt / how.substeps, self.dtype == torch.float32)
         else:
             check_soft(scene)
         self._launcher = Launcher(scene, n, self.options)
