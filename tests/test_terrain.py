@@ -17,7 +17,8 @@ from diffsim.extra import render
 from diffsim.extra.drive import web
 from diffsim.extra.render import slabs
 from diffsim.extra.terrain import LENGTH, LEVEL, incline, rough, step, uneven
-from diffsim.robot.scene import Scene, TerrainError
+from diffsim.extra.variation import Variation
+from diffsim.robot.scene import FACTORS, Scene, TerrainError
 from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -215,6 +216,49 @@ def test_an_option_makes_uneven_ground():
     ):
         with pytest.raises(ValueError, match=message):
             diffsim.make(name, count, seed=seed)
+
+
+@pytest.mark.parametrize("name", ["walker:rough=20", "ant:friction=0.5:1.5"])
+def test_gradient_of_a_window_with_options_is_that_of_differences(name, rng):
+    """On slopes, away from the level start, and where each environment has its own friction; the robots touch ground.
+
+    Of a weighted sum of observations and rewards with respect to all actions and velocities.
+    """
+    factors = "friction" in name
+    env = diffsim.make(name, 3, seed=3, horizon=3, dtype=torch.float64, contact="soft", factors=factors)
+    env.early_termination = False
+    if factors:
+        Variation(env, 5).set(1)
+        assert len(env.sim.factors[:, FACTORS.index("mu")].unique()) == 3
+    qpos, nu, nv = env.qpos.clone(), env.scene.nu, env.scene.nv
+    if env.task.ground is not None:
+        qpos[:, 0] = torch.linspace(4.0, 12.0, 3)
+        qpos = env.task.ground.lift(qpos)
+        slope = env.task.ground.lift(qpos + 1e-3 * torch.eye(env.scene.nq)[0]) - env.task.ground.lift(qpos)
+        assert (slope[:, 1].abs() > 1e-5).all()
+    env.set_state(qpos, env.qvel)
+    with torch.no_grad():
+        for _ in range(15):
+            env.step(torch.zeros(3, nu).double())
+    qpos, weights = env.qpos.clone(), torch.tensor(rng.normal(size=(3, env.task.obs_dim)))
+
+    def total(x):
+        env.reset(seed=1)
+        env.set_state(qpos, x[:, :nv])
+        result = torch.zeros(3).double()
+        for action in x[:, nv:].split(nu, 1):
+            _, reward, _, _, info = env.step(action)
+            assert not info["nonfinite"].any()
+            result = result + reward + (weights * info["final_obs"]).sum(1)
+        return result
+
+    x = torch.cat((env.qvel, torch.tensor(rng.uniform(-0.6, 0.6, (3, 3 * nu)))), 1).requires_grad_()
+    (gradient,) = torch.autograd.grad(total(x).sum(), x)
+    expected, x = torch.zeros_like(x), x.detach()
+    with torch.no_grad():
+        for column, step_ in enumerate(1e-6 * torch.eye(x.shape[1]).double()):
+            expected[:, column] = (total(x + step_) - total(x - step_)) / 2e-6
+    assert ((gradient - expected).norm(dim=1) < 1e-6 * expected.norm(dim=1)).all()
 
 
 def test_environments_that_share_a_task_have_their_own_ground():

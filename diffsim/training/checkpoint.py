@@ -22,6 +22,7 @@ from diffsim.training.errors import fail
 POLICIES = Path(__file__).resolve().parents[1] / "policies"  # that come with the package
 FORMAT = 2
 POLICY = {"script", "args", "iteration", "policy"}  # what an exported policy has
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # codes of a terminal; a path may have other unprintable characters
 SHOWN = ("script", "iteration", "simulator")  # in messages, besides args
 PROVENANCE = "diffsim.extra.provenance"  # of the robot
 HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one
@@ -137,7 +138,7 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
         whole = whole and (form != FORMAT or state.keys() >= POLICY)
         if whole and form == FORMAT:
             shown = *state["args"], *state["args"].values(), *(state.get(name) for name in SHOWN)
-            whole = all(str(text).isprintable() for text in shown)  # no codes for a terminal in what messages show
+            whole = not any(CONTROL.search(str(text)) for text in shown)
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         whole = False
     if not whole:

@@ -80,6 +80,13 @@ def test_anything_else_is_refused_in_one_line(tmp_path, capsys):
         assert f": {path} is not a complete checkpoint" in refusal(lambda: load(path), capsys)
 
 
+def test_an_argument_may_have_any_other_character(tmp_path):
+    """Those of a folder of a task of your own, say: a no-break space, and one that is no UTF-8."""
+    for name in ("my\xa0task.py", "my\udcfftask.py", "m\u00fc\u200b.py"):
+        save(path := tmp_path / "checkpoint.pt", "shac", Tiny(), STATE | {"args": {"env": name}})
+        assert load(path)["args"]["env"] == name
+
+
 def test_weights_are_compared_before_layers_are_built(tmp_path, capsys):
     path = tmp_path / "checkpoint.pt"
     save(path, "shac", Tiny(), STATE)
