@@ -56,7 +56,7 @@ def test_a_name_without_its_options() -> None:
     for name, base in (
         ("ant", "ant"),
         ("go2:rough=20,mass=0.9:1.1", "go2"),
-        ("g1_track:/tmp/walk.csv:60", "g1_track"),
+        ("g1_track:/data/walk.csv:60", "g1_track"),
         ("my/task.py", "my/task.py"),
         ("my/task.py:Class", "my/task.py:Class"),
     ):
