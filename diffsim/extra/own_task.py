@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import functools
 import importlib.util
 import math
 import sys
 import traceback
+from collections.abc import Sequence
 from difflib import get_close_matches
 from numbers import Integral
 from pathlib import Path
 from types import ModuleType
 
+import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
-from diffsim.robot.scene import Scene
+from diffsim.robot.elements import control_range, home_key, label, listed, servos
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import Array, Scene
 from diffsim.sim.integration import is_real
 from diffsim.tasks import FILE, Task, TaskError
 
@@ -57,6 +64,44 @@ def _module(path: Path, _changed: int) -> ModuleType:
     finally:
         sys.path.remove(str(path.parent))
     return module
+
+
+# Actions about the start ----------------------------------------------------------------------------------------------
+
+
+def start_control(m: mujoco.MjModel, start: Sequence[float] = ()) -> Array:
+    """Return the controls (nu,) of the start: the ctrl of its keyframe, see elements.home_key.
+
+    Without keyframe, with one that has no ctrl, or for another start (qpos first), they are those without force there.
+    """
+    key = -1 if len(start) else home_key(m)
+    if key >= 0 and m.key_ctrl[key].any():
+        return np.array(m.key_ctrl[key])
+    qpos = np.array(start[: m.nq]) if len(start) else m.key_qpos[key] if key >= 0 else m.qpos0
+    control, (gain, (constant, stiffness)) = np.zeros(m.nu), (m.actuator_gainprm[:, 0], m.actuator_biasprm[:, :2].T)
+    for a in np.flatnonzero(servos(m) & (gain != 0)).tolist():  # each on a hinge or a slide
+        angle = qpos[m.jnt_qposadr[m.actuator_trnid[a, 0]]]
+        control[a] = -(constant[a] + stiffness[a] * m.actuator_gear[a, 0] * angle) / gain[a]
+    return control
+
+
+def around_start(task: Task, scene: Scene) -> Scene:
+    """Return the robot whose action 0 is the start's control, and whose actions add up to task.action_scale to it.
+
+    Where the ctrlrange ends nearer, actions reach as far to both sides. Raises TaskError if the start's control is no
+    inner point of it.
+    """
+    scale, m = task.action_scale, copy.copy(scene.mj_model)
+    if not is_real(scale) or not 0 < scale < math.inf:
+        raise TaskError(f"task {task.name!r}: action_scale is {scale!r}, must be positive, or None")
+    zero, (low, high) = start_control(m, task.start), control_range(m)
+    room = np.where(m.actuator_ctrllimited != 0, np.minimum(zero - low, high - zero), np.inf)
+    if len(out := np.flatnonzero(room <= 0).tolist()):
+        names = listed(label(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a) for a in out)
+        raise TaskError(f"task {task.name!r}: with action_scale the start's control must lie within ctrlrange: {names}")
+    m.actuator_ctrllimited[:] = 1
+    m.actuator_ctrlrange[:] = np.stack((zero, zero), 1) + np.minimum(scale, room)[:, None] * (-1.0, 1.0)
+    return dataclasses.replace(load_scene(m), name=scene.name, path=scene.path)
 
 
 # Checks, which Task.bind asks for ------------------------------------------------------------------------------------

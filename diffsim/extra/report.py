@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.extra.gait import trace
+from diffsim.extra.own_task import start_control
 from diffsim.robot.contact import (
     HULL_POINTS,
     base_geoms,
@@ -180,12 +181,12 @@ def _actuators(scene: Scene) -> Iterator[str]:
     if free:
         yield f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {listed(free)}."
     if m.nkey and m.nu:
-        zero = np.mean(control_range(m), axis=0)
-        if len(moved := np.flatnonzero(abs(m.key_ctrl[0] - zero) > 1e-6)):
-            a = int(moved[0])
+        zero, start = np.mean(control_range(m), axis=0), start_control(m)
+        if len(moved := np.flatnonzero(abs(start - zero) > 1e-6)):
+            a, more = int(moved[0]), f", and of {len(moved) - 1} more" * (len(moved) > 1)
             yield (
-                f"Action 0 is the middle of a ctrlrange, not the ctrl of the file's keyframe: {zero[a]:g}, not "
-                f"{m.key_ctrl[0, a]:g}, of actuator {label(m, Kind.mjOBJ_ACTUATOR, a)}, and of {len(moved) - 1} more."
+                "Without a task's action_scale, action 0 is the middle of a ctrlrange, not the ctrl of the file's "
+                f"keyframe: {zero[a]:g}, not {start[a]:g}, of actuator {label(m, Kind.mjOBJ_ACTUATOR, a)}{more}."
             )
     if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         yield "A control sets the activation of a <muscle> at once."

@@ -58,8 +58,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             links[i].qd = read(batch.qvel, e, VADR + link_of(m, here.at + i))
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
-                adr = qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b])
-                ball_rot[b] = wp.normalize(kin.load_quat(batch.qpos, e, adr))
+                slot = m.ball_slot[here.lane * NBALL + b]
+                ball_rot[b] = wp.normalize(kin.load_quat(batch.qpos, e, qpos_adr(m, here.at + slot)))
+                for k in range(3):
+                    links[slot + k].q = T(0.0)  # was a part of the quaternion; place_balls sets those of springs
         links[0].R = wp.identity(3, dtype=T)
         root = Root()
         if wp.static(FLOATING):

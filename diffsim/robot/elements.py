@@ -61,6 +61,11 @@ def control_range(m: mujoco.MjModel) -> tuple[Array, Array]:
     return low, np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
 
 
+def home_key(m: mujoco.MjModel) -> int:
+    """Return the index of the keyframe "home", else of the first one; -1 if the file has none."""
+    return max(mujoco.mj_name2id(m, Kind.mjOBJ_KEY, "home"), min(0, m.nkey - 1))
+
+
 def disabled_flags(m: mujoco.MjModel) -> set[str]:
     """Return the names of <flag> that the file disables."""
     return _set_bits(mujoco.mjtDisableBit.__members__, "mjDSBL_", m.opt.disableflags)

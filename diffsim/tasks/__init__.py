@@ -32,8 +32,7 @@ class Tasks(Mapping[str, type[Task]]):
     """The registered tasks by name. A class is imported when it is first looked up."""
 
     def __getitem__(self, name: str) -> type[Task]:
-        kind: type[Task] = pkgutil.resolve_name(REGISTERED[name])
-        return kind
+        return pkgutil.resolve_name(REGISTERED[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(REGISTERED)
@@ -43,7 +42,6 @@ class Tasks(Mapping[str, type[Task]]):
 
 
 TASKS = Tasks()
-_restored: dict[str, type[Task]] = {}  # those that a checkpoint brought along, by the name with which it was trained
 
 
 def base_name(name: str) -> str:
@@ -61,15 +59,14 @@ def find_task(name: str | type[Task]) -> type[Task]:
     if isinstance(name, type) and issubclass(name, Task):
         return name
     if FILE.fullmatch(str(name)):
-        kind: type[Task] = pkgutil.resolve_name(OWN_TASK)(name)
-        return kind
+        return pkgutil.resolve_name(OWN_TASK)(name)
     base, options = base_name(str(name)), str(name).partition(":")[2]
     if base not in TASKS:
         raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
-    return _restored.get(name) or (TASKS[base] if name == base else TASKS[base].configured(options))
+    return TASKS[base] if name == base else TASKS[base].configured(options)
 
 
 def restore_task(name: str, stored: dict[str, object]) -> None:
-    """Let `find_task` return the task of a name as a checkpoint stored it (Task.stored), without its files."""
-    if stored:
-        _restored[name] = TASKS[base_name(name)].restored(name, stored)
+    """Let `find_task` take what a checkpoint stored (Task.stored) in place of the files that its task's name names."""
+    if (base := base_name(name)) in TASKS:
+        TASKS[base].restore(name.partition(":")[2], stored)

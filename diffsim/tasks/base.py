@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from diffsim.robot.elements import home_key
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
 from diffsim.sim.elevation import Elevation
@@ -29,7 +30,7 @@ Accuracy = Literal["fast", "default", "accurate"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
 OPTIONS = "diffsim.extra.variation:configure"  # reads options after a task's name
-OWN_TASK = "diffsim.extra.own_task"  # checks tasks outside this package
+OWN_TASK = "diffsim.extra.own_task"  # checks tasks outside this package, centres actions
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
@@ -61,6 +62,7 @@ class Task:
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: float = 1 / 60  # s
+    action_scale: ClassVar[float | None] = None  # control per action, from the start's on; None: over the ctrlrange
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
     ground: Elevation | None = None  # set by an environment on terrain: heights are then those over it at the root's x
     start: tuple[float, ...] = ()  # by default the robot's keyframe "home", its first one, or qpos0; at rest
@@ -93,8 +95,9 @@ class Task:
         raise TaskError(f"task {cls.name!r}: no robot file {str(asset)!r} in {' or '.join(map(str, folders))}")
 
     def scene(self) -> Scene:
-        """Return the robot as this task drives it; by default that of `load_robot`."""
-        return self.load_robot()
+        """Return the robot as this task drives it; by default that of `load_robot`, with its action_scale."""
+        scene = self.load_robot()
+        return scene if self.action_scale is None else pkgutil.resolve_name(OWN_TASK).around_start(self, scene)
 
     @torch.no_grad()
     def bind(self, scene: Scene) -> Task:
@@ -112,8 +115,7 @@ class Task:
         if type(self).reset is Task.reset:
             self._nq, self._quaternions = scene.nq, scene.quaternion_adr.tolist()
             if not len(self._start):
-                key = max(mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
-                home = self._start.new_tensor(m.key_qpos[key] if m.nkey else scene.qpos0)
+                home = self._start.new_tensor(m.key_qpos[home_key(m)] if m.nkey else scene.qpos0)
                 self._start = torch.cat((home, self._start.new_zeros(scene.nv)))
         if own is not None:
             own.check_methods(self, scene)
@@ -179,8 +181,7 @@ class Task:
     @classmethod
     def configured(cls, options: str) -> type[Task]:
         """Return the task with the options that follow its name and a colon; raises TaskError for unknown ones."""
-        configured: type[Task] = pkgutil.resolve_name(OPTIONS)(cls, options)
-        return configured
+        return pkgutil.resolve_name(OPTIONS)(cls, options)
 
     @classmethod
     def terrain(cls, num_envs: int, seed: int) -> np.ndarray | None:
@@ -193,9 +194,8 @@ class Task:
         return {}
 
     @classmethod
-    def restored(cls, name: str, stored: dict[str, Any]) -> type[Task]:
-        """Return the task of a name, its own and options, with what `stored` gave."""
-        raise NotImplementedError
+    def restore(cls, options: str, stored: dict[str, Any]) -> None:
+        """Let `configured` take what `stored` gave in place of the files that the options name; none if it is empty."""
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """Draw start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).

@@ -16,6 +16,7 @@ import shac
 from diffsim import tasks
 from diffsim.extra import commands as command
 from diffsim.extra.learning.likeliest import Likeliest
+from diffsim.extra.robots.imitation import task as imitation
 from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.tracking import G1Track
 from diffsim.extra.robots.joystick import Go1
@@ -107,7 +108,7 @@ def test_an_exported_policy_holds_a_clip_that_is_not_shipped_and_may_have_16_bit
     for half in ([], ["--half"]):
         command.main(["export", str(path), str(output := tmp_path / "policy.pt"), *half])
         sizes.append(output.stat().st_size)
-        monkeypatch.setattr(tasks, "_restored", {})
+        monkeypatch.setattr(imitation, "RESTORED", {})
         saved = load_policy(output)
         assert tasks.find_task(saved.args["env"])().clip == clip  # type: ignore[attr-defined]
         assert (output.stat().st_size < 50_000) == (name == "g1_jazz_walk")

@@ -276,6 +276,70 @@ def test_a_policy_of_a_task_that_has_changed_since_is_refused() -> None:
     assert fitting(torch.nn.Linear(5, 1), env)
 
 
+# Its actions ----------------------------------------------------------------------------------------------------------
+
+SERVOS = """
+<mujoco>
+  <worldbody>
+    <body> <joint name="a"/> <geom size=".1" pos="1 0 0"/>
+      <body> <joint name="b" ref="30"/> <geom size=".1" pos="1 0 0"/> </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="servo" joint="a" kp="9" ctrlrange="-1 1"/>
+    <general joint="b" gear="-2" gainprm="4" biasprm="1 -8 -1" biastype="affine"/>
+    <motor name="motor" joint="a" ctrlrange="-2 2"/>
+  </actuator>
+  <keyframe> {keys} </keyframe>
+</mujoco>"""
+KEYS = '<key ctrl="9 9 9"/> <key name="home" qpos=".3 .1" ctrl="{}"/>'
+STILL = (-0.5, 0.2, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "keys, attributes, zero, width",
+    [
+        (KEYS.format(".8 3 -.5"), {}, (0.8, 3, -0.5), (0.2, 0.5, 0.5)),  # the keyframe's ctrl, within ctrlrange
+        (KEYS.format("0 0 0"), {}, (0.3, -0.65, 0), (0.5, 0.5, 0.5)),  # a keyframe without ctrl: its pose
+        ("", {}, (0, -0.25 - 4 * np.pi / 6, 0), (0.5, 0.5, 0.5)),  # no keyframe: the reference pose
+        (KEYS.format(".8 3 -.5"), {"start": STILL}, (-0.5, -1.05, 0), (0.5, 0.5, 0.5)),  # another start: its pose
+        (KEYS.format(".8 3 -.5"), {"action_scale": 9}, (0.8, 3, -0.5), (0.2, 9, 1.5)),
+    ],
+)
+def test_action_zero_of_a_scaled_task_is_the_control_of_its_start(
+    keys: str, attributes: dict[str, object], zero: tuple[float, ...], width: tuple[float, ...]
+) -> None:
+    model = mujoco.MjModel.from_xml_string(SERVOS.format(keys=keys))
+    kind = type("Scaled", (Bare,), {"asset": model, "action_scale": 0.5} | attributes)
+    task = kind()
+    scene, (start, _) = task.scene(), kind().bind(task.load_robot()).reset(torch.full((1, 4), 0.5))
+    ranges = scene.mj_model.actuator_ctrlrange
+    np.testing.assert_allclose(ranges.mean(1), zero, atol=1e-12)
+    np.testing.assert_allclose(ranges[:, 1] - ranges[:, 0], 2 * np.array(width))
+    np.testing.assert_allclose(scene.gear, 0.5 * np.ptp(ranges, 1) * (9, -8, 1))
+    assert scene.name == task.load_robot().name
+    if "ctrl" not in keys or "0 0 0" in keys or "start" in attributes:  # no actuator pushes there
+        data = mujoco.MjData(model)
+        data.qpos, data.ctrl = start[0].numpy(), ranges.mean(1)
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(data.actuator_force, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "scale, ctrl, message",
+    [
+        (0.0, "0 0 1", "action_scale is 0.0, must be positive, or None"),
+        ("1", "0 0 1", "action_scale is '1', must be positive, or None"),
+        (1.0, "1 0 2", "with action_scale the start's control must lie within ctrlrange: 'servo', 'motor'"),
+    ],
+)
+def test_an_action_scale_that_does_not_fit_is_named(scale: object, ctrl: str, message: str) -> None:
+    model = mujoco.MjModel.from_xml_string(SERVOS.format(keys=KEYS.format(ctrl)))
+    with pytest.raises(TaskError) as error:
+        diffsim.make(type("Scaled", (Bare,), {"asset": model, "action_scale": scale, "name": "mine"}), 1)
+    assert line_of(error) == f"task 'mine': {message}"
+
+
 # Forward --------------------------------------------------------------------------------------------------------------
 
 SLIDES = """

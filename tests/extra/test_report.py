@@ -85,7 +85,7 @@ def test_command(tmp_path, capsys):
                 rest='<actuator><position name="s" joint="hinge" ctrlrange="0 1"/></actuator><keyframe><key ctrl=".2"/>'
                 "</keyframe>"
             ),
-            "Action 0 is the middle of a ctrlrange, not the ctrl of the file's keyframe: 0.5, not 0.2, of actuator 's'",
+            "0 is the middle of a ctrlrange, not the ctrl of the file's keyframe: 0.5, not 0.2, of actuator 's'.",
         ),
         (
             pendulum(inside='<geom type="cylinder" size="1 2"/><geom type="ellipsoid" size="1 2 3"/>'),

@@ -14,6 +14,7 @@ from diffsim.extra.robots.imitation.kinematics import Kinematics, difference, ma
 from diffsim.tasks.base import Contact, Task, TaskError
 from diffsim.tasks.humanoid import Humanoid
 
+RESTORED: dict[str, Clip] = {}  # those that a checkpoint brought along, by the option that named their file
 STRAY = 0.5  # m; the episode ends when the root is further from the reference's
 
 
@@ -41,8 +42,8 @@ class Imitation(Task):
 
     @classmethod
     def with_clip(cls, clip: Clip | Path | str) -> type[Imitation]:
-        """Return the task that tracks a clip, or that of a file or folder, see read_clip."""
-        given = clip if isinstance(clip, Clip) else read_clip(clip)
+        """Return the task that tracks a clip, or that of a file or folder, see read_clip, unless one is restored."""
+        given = clip if isinstance(clip, Clip) else RESTORED.get(str(clip)) or read_clip(clip)
         return type(cls.__name__, (cls,), {"given_clip": given, "__module__": cls.__module__})
 
     @classmethod
@@ -54,10 +55,11 @@ class Imitation(Task):
         return {"name": clip.name, "qpos": clip.qpos, "loop": clip.loop, "lengths": clip.lengths}
 
     @classmethod
-    def restored(cls, name: str, stored: dict[str, Any]) -> type[Task]:
-        others = [option for option in name.partition(":")[2].split(",") if "=" in option]
-        kind = cls.with_clip(Clip(**stored))
-        return kind.configured(",".join(others)) if others else kind
+    def restore(cls, options: str, stored: dict[str, Any]) -> None:
+        for clip in (option for option in options.split(",") if "=" not in option):
+            RESTORED.pop(clip, None)
+            if stored:
+                RESTORED[clip] = Clip(**stored)
 
     def first_step(self, rand: Tensor) -> Tensor:
         """The frame (...) int64 where an episode from rand (..., 1) starts (DeepMimic, 6.1: reference state init.)."""

@@ -17,8 +17,10 @@ import diffsim
 import ppo_baseline
 from diffsim import tasks
 from diffsim.extra.export import export_policy
+from diffsim.extra.robots.imitation import task as imitation
 from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.task import STRAY, HumanoidImitation
+from diffsim.extra.variation import on_a_plane
 from diffsim.extra.watch import make_policy_env
 from diffsim.training import checkpoint, load_policy, parse
 
@@ -318,7 +320,7 @@ def test_a_motion_that_does_not_loop_ends() -> None:
 
 def test_checkpoints_hold_the_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run is resumed and evaluated, in another process, when its file is gone."""
-    monkeypatch.setattr(tasks, "_restored", {})
+    monkeypatch.setattr(imitation, "RESTORED", {})
     file = write(tmp_path / "mine.npz", qpos=stroll(2, 30, True), fps=30)
     clip, run, there = read_clip(file), tmp_path / "run", str(tmp_path / "run" / "checkpoint.pt")
     flags = f"--env humanoid_imitation:{file} --num-envs 4 --horizon 2 --minibatch-size 4 --eval-episodes 2"
@@ -333,10 +335,10 @@ def test_checkpoints_hold_the_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert checkpoint.load(run / "checkpoint.pt")["iteration"] == 2
     export_policy(run / "checkpoint.pt", tmp_path / "policy.pt")
     for path in (run / "checkpoint.pt", tmp_path / "policy.pt"):
-        tasks._restored.clear()
+        imitation.RESTORED.clear()
         env = make_policy_env(load_policy(path), 2)
         assert isinstance(env.task, HumanoidImitation) and env.task.clip == clip and str(env.task.clip) == "mine"
-    tasks._restored.clear()
+    imitation.RESTORED.clear()
     ppo_baseline.main(["--evaluate", there, "--eval-episodes", "2", "--run-dir", str(tmp_path / "evaluation")])
     env = make_policy_env(load_policy(there), 1, env="humanoid_imitation:humanoid_run")  # tracked as well
     assert env.task.clip == read_clip("humanoid_run")  # type: ignore[attr-defined]
@@ -344,8 +346,9 @@ def test_checkpoints_hold_the_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert parse(ppo_baseline.Args, ["--evaluate", there, "--env", name]).env == name
 
 
-def test_a_restored_task_keeps_its_other_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tasks, "_restored", {})
+def test_a_restored_clip_serves_its_task_with_any_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And no longer once a checkpoint is loaded that brings none."""
+    monkeypatch.setattr(imitation, "RESTORED", {})
     file = write(tmp_path / "mine.npz", qpos=stroll(2, 30, True), fps=30)
     name = f"humanoid_imitation:mass=0.9:1.1,{file},rough=10"
     trained = tasks.find_task(name)
@@ -356,6 +359,11 @@ def test_a_restored_task_keeps_its_other_options(tmp_path: Path, monkeypatch: py
     assert found().clip == trained().clip and found.slope == 10.0  # type: ignore[attr-defined]
     assert found.ranges == {"mass": (0.9, 1.1)} == trained.ranges  # type: ignore[attr-defined]
     assert found.varied_by == trained.varied_by is not None and found.stored().keys() == stored.keys()
+    for other in (on_a_plane(name), f"humanoid_imitation:{file},mass=0.5:1"):
+        assert tasks.find_task(other)().clip == trained().clip  # type: ignore[attr-defined]
+    tasks.restore_task(name, {})
+    with pytest.raises(ValueError, match="no such clip"):
+        tasks.find_task(name)
 
 
 def test_a_shipped_clip_is_not_stored() -> None:
