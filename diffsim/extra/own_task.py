@@ -85,13 +85,14 @@ def start_control(m: mujoco.MjModel, start: Sequence[float] = ()) -> Array:
     return control
 
 
-def around_start(task: Task, scene: Scene) -> Scene:
-    """Return the robot whose action 0 is the start's control, and whose actions add up to task.action_scale to it.
+def around_start(task: Task) -> Scene:
+    """Return the task's robot so that action 0 is the start's control, to which actions add up to task.action_scale.
 
     Where the ctrlrange ends nearer, actions reach as far to both sides. Raises TaskError if the start's control is no
     inner point of it.
     """
-    scale, m = task.action_scale, copy.copy(scene.mj_model)
+    scale, scene = task.action_scale, task.load_robot()
+    m = copy.copy(scene.mj_model)
     if not is_real(scale) or not 0 < scale < math.inf:
         raise TaskError(f"task {task.name!r}: action_scale is {scale!r}, must be positive, or None")
     zero, (low, high) = start_control(m, task.start), control_range(m)

@@ -42,8 +42,9 @@ ZERO = """eq_active0 geom_adhesion geom_surfacevel jnt_springyield jnt_stiffness
     pair_solreffriction tendon_stiffness tendon_stiffnesspoly tendon_damping tendon_dampingpoly tendon_limited
     tendon_frictionloss tendon_armature tendon_actfrclimited tendon_springyield actuator_damping actuator_dampingpoly
     actuator_armature actuator_delay""".split()
-FINITE = """geom_friction geom_margin geom_gap geom_solmix geom_solref geom_solimp pair_friction pair_margin pair_gap
-    pair_solref pair_solimp jnt_margin jnt_solref jnt_solimp dof_solref dof_solimp""".split()
+FINITE = """body_pos body_quat geom_friction geom_margin geom_gap geom_solmix geom_solref geom_solimp pair_friction
+    pair_margin pair_gap pair_solref pair_solimp jnt_margin jnt_solref jnt_solimp dof_solref dof_solimp
+    dof_frictionloss""".split()
 POSITIVE = "jnt_stiffness dof_armature dof_damping dof_frictionloss geom_friction geom_solmix pair_friction".split()
 # What a file calls them, where that is another word
 WORDS = {"active0": "this constraint", "limited": "range", "actfrclimited": "actuatorfrcrange"}

@@ -96,8 +96,7 @@ class Task:
 
     def scene(self) -> Scene:
         """Return the robot as this task drives it; by default that of `load_robot`, with its action_scale."""
-        scene = self.load_robot()
-        return scene if self.action_scale is None else pkgutil.resolve_name(OWN_TASK).around_start(self, scene)
+        return self.load_robot() if self.action_scale is None else pkgutil.resolve_name(OWN_TASK).around_start(self)
 
     @torch.no_grad()
     def bind(self, scene: Scene) -> Task:

@@ -81,6 +81,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "body 'fin': in a fluid each body needs a joint; merge its geoms": pendulum(
         inside=f'<body name="fin">{BALL}</body>', rest='<option density="1"/>'
     ),
+    "body 'base': pos must be finite": robot(f'<body name="base" pos="nan 0 1"><freejoint/>{BALL}</body>'),
     "geom 'hull': fluidshape ellipsoid is not simulated": pendulum(
         inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'
     ),

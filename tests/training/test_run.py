@@ -229,6 +229,10 @@ def process(script: str, *arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command, text=True, stderr=subprocess.PIPE, env=os.environ | PATH)
 
 
+def rows_of(directory: Path) -> int:
+    return len(read_progress(directory)) if (directory / "progress.csv").exists() else 0
+
+
 def is_free(directory: Path) -> bool:
     """Whether another process could lock a run's directory."""
     program = "import fcntl, sys; fcntl.lockf(open(sys.argv[1], 'a'), fcntl.LOCK_EX | fcntl.LOCK_NB)"
@@ -236,12 +240,18 @@ def is_free(directory: Path) -> bool:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
-def test_a_directory_belongs_to_one_process(tmp_path, capsys):
-    """Of two that start at once and of one that resumes the other; a killed one leaves it free."""
-    arguments = *TINY, "--iterations", 10**6, "--eval-every", 0, "--save-every", 1, "--quiet", "--run-dir", tmp_path
-    both = [process("bptt", *arguments, "--seed", seed) for seed in (1, 2)]
+@pytest.mark.parametrize("case", ["start", "start and save each iteration", "resume"])
+def test_two_processes_in_one_directory(case, tmp_path, capsys):
+    """The second is refused and leaves everything to the first; a killed one leaves the directory free."""
+    save = 0 if case == "start" else 1
+    arguments = *TINY, "--iterations", 10**6, "--eval-every", 0, "--save-every", save, "--quiet"
+    commands = [(*arguments, "--run-dir", tmp_path, "--seed", seed) for seed in (1, 2)]
+    if case == "resume":
+        run(bptt, tmp_path, *arguments, stop_after=1)
+        commands = 2 * [("--resume", tmp_path)]
+    both = [process("bptt", *command) for command in commands]
     try:
-        while all(each.poll() is None for each in both) or not (tmp_path / "checkpoint.pt").exists():
+        while all(each.poll() is None for each in both) or rows_of(tmp_path) < 3:
             assert any(each.poll() is None for each in both)
             time.sleep(0.05)
         second, first = sorted(both, key=lambda each: each.poll() is None)
@@ -250,17 +260,21 @@ def test_a_directory_belongs_to_one_process(tmp_path, capsys):
         late = f"{tmp_path} holds another run's checkpoint.pt: --resume it, or choose"  # it starts after the first save
         assert second.wait() == 2 and error in [f"bptt.py: {why} another --run-dir" for why in (holder, late)]
         for resumed in (tmp_path, tmp_path / "checkpoint.pt"):
-            assert holder in refusal(lambda path=resumed: bptt.main(["--resume", str(path)]), capsys)
+            if save:
+                assert holder in refusal(lambda path=resumed: bptt.main(["--resume", str(path)]), capsys)
         assert first.poll() is None and not is_free(tmp_path)
     finally:
         for each in both:
             each.kill()
             each.wait()
             each.stderr.close()
-    saved = checkpoint.load(tmp_path)["iteration"]
-    assert 0 <= len(read_progress(tmp_path)) - saved <= 1  # none is missing
-    run(bptt, tmp_path, "--resume", tmp_path / "checkpoint.pt", stop_after=saved + 2)
-    assert checkpoint.load(tmp_path)["iteration"] == saved + 2 == len(read_progress(tmp_path))
+    rows = [int(row["iteration"]) for row in read_progress(tmp_path)]
+    assert is_free(tmp_path) and rows == [*range(1, len(rows) + 1)]  # of one run, and none is missing
+    if save:
+        saved = checkpoint.load(tmp_path)["iteration"]
+        assert 0 <= len(rows) - saved <= 1
+        run(bptt, tmp_path, "--resume", tmp_path / "checkpoint.pt", stop_after=saved + 2)
+        assert checkpoint.load(tmp_path)["iteration"] == saved + 2 == len(read_progress(tmp_path))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
