@@ -26,6 +26,7 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
 
 State = tuple[Tensor, Tensor, Tensor, Tensor]  # qpos, qvel, observation and memory, (N, ...) each
+Step = tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]  # what gymnasium's step returns
 Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
 RENDERER = "diffsim.extra.render:Renderer"  # loaded with the first picture
 STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_statistics
@@ -121,6 +122,7 @@ class DiffEnv(VectorEnv):
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
         self.qpos, self.qvel, self._obs, self.memory = self._draw_starts(1)[0]
         self._pinned: State | None = None
+        self._disturb = self.task.disturb
         # Start states of the whole window: one batch of operations, not one per step
         self._starts, self._time = self._draw_starts(horizon), 0
 
@@ -151,7 +153,7 @@ class DiffEnv(VectorEnv):
         return self._obs.clone(), {}
 
     @in_plain_mode
-    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor) -> Step:
         """Take one control step in all environments, and reset those that end.
 
         Args:
@@ -167,33 +169,52 @@ class DiffEnv(VectorEnv):
             ValueError: action of the wrong shape, dtype or device; an ActionError on the CPU if it is not a number.
             RuntimeError: more than `horizon` differentiable steps without `detach`.
         """
-        _, reward, terminated, truncated, info = self.advance(action)
+        outcome = self._act(action)
         if self._time == self.horizon:
             self._starts, self._time = self._draw_starts(self.horizon), 0
-        self._start_episodes(info["_final_obs"], self._starts[self._time])
-        self._time += 1
-        return self._obs.clone(), reward, terminated, truncated, info
+        starts, self._time = self._starts[self._time], self._time + 1
+        return self._conclude(*outcome, starts)
 
-    def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def advance(self, action: Tensor) -> Step:
         """Do what `step` does except the reset: obs is info["final_obs"], and ended episodes wait for `reset`."""
+        return self._conclude(*self._act(action), None)
+
+    def _act(self, action: Tensor) -> tuple[State, Tensor, Tensor, Tensor]:
+        """Take a control step; returns the state after it, the reward, and (N,) bool: terminated, and not finite."""
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
             raise ActionError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
-        self.qpos, self.qvel = self.sim.advance(self.qpos, *self.task.disturb(self.qvel, action, self.memory))
-        if self.adjoint_clip and self.qpos.requires_grad:
-            self.qpos, self.qvel = ClipAdjoint.apply(self.adjoint_clip, self.qpos, self.qvel)
-        nonfinite = self.sim.nonfinite.clone()
+        qpos, qvel = self.sim.advance(self.qpos, *self._disturb(self.qvel, action, self.memory))
+        if self.adjoint_clip and qpos.requires_grad:
+            qpos, qvel = ClipAdjoint.apply(self.adjoint_clip, qpos, qvel)
+        noise = self._uniform(self.num_envs, self.task.num_noise) if self.task.num_memory else self.memory
+        obs, memory, reward, terminated, failed = self._judge(
+            qpos, qvel, action, self.memory, noise, self.sim.nonfinite
+        )
+        return (qpos, qvel, obs, memory), reward, terminated, failed
+
+    def _judge(
+        self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor, noise: Tensor, nonfinite: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return the observation, the memory, the reward, terminated and a copy of nonfinite after a control step."""
+        failed = nonfinite.clone()
         if self.task.num_memory:
-            noise = self._uniform(self.num_envs, self.task.num_noise)
-            self.memory = self.task.remember(self.memory, action, noise)
-        self._obs = obs = self.observe(self.qpos, self.qvel, action)
-        reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)
+            memory = self.task.remember(memory, action, noise)
+        obs = self._observe(qpos, qvel, action, memory)
+        reward = self.task.reward(obs, action).masked_fill(failed, 0.0)
+        with torch.no_grad():
+            ended = self.task.terminated(obs) if self.early_termination else self.task.over(obs)
+        return obs, memory, reward, ended | failed, failed
+
+    def _conclude(
+        self, state: State, reward: Tensor, terminated: Tensor, nonfinite: Tensor, starts: State | None
+    ) -> Step:
+        """Count what `_act` returned, and start new episodes where one ended, unless starts is None."""
         with torch.no_grad():
             self.episode_step += 1
             self._episode_return += reward
-            terminated = (self.task.terminated(obs) if self.early_termination else self.task.over(obs)) | nonfinite
             truncated = (self.episode_step >= self.episode_length) & ~terminated
             done = terminated | truncated
             length = self.episode_step.clone()
@@ -202,7 +223,18 @@ class DiffEnv(VectorEnv):
             self._statistics["return"].addcmul_(done, self._episode_return)
             self._statistics["length"].addcmul_(done, length)
             self._statistics["nonfinite"] += nonfinite
-        info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
+        final_obs = obs = state[2]
+        self._set_state(state)
+        if starts is not None:
+            self._start_episodes(done, starts)
+            obs = self._obs.clone()
+        info = {
+            "final_obs": final_obs,
+            "_final_obs": done,
+            "episode": episode,
+            "_episode": done,
+            "nonfinite": nonfinite,
+        }
         return obs, reward, terminated, truncated, info
 
     def _start_episodes(self, mask: Tensor, starts: State) -> None:
@@ -211,6 +243,13 @@ class DiffEnv(VectorEnv):
         self._set_state(torch.where(row, start, now) for start, now in zip(starts, self._state(), strict=True))
         self.episode_step.masked_fill_(mask, 0)
         self._episode_return.masked_fill_(mask, 0.0)
+
+    def compile(self) -> None:
+        """Fuse what a step does beside the simulator into a few kernels of torch.compile, made at the next steps."""
+        self._judge = torch.compile(self._judge, dynamic=False)  # type: ignore[method-assign]
+        self._conclude = torch.compile(self._conclude, dynamic=False)  # type: ignore[method-assign]
+        if type(self.task).disturb is not Task.disturb:
+            self._disturb = torch.compile(self._disturb, dynamic=False)
 
     def render(self) -> Frames:
         """Draw a frame (height, width, 3) of each environment.
@@ -297,9 +336,12 @@ class DiffEnv(VectorEnv):
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         """Return the task's observation (N, obs_dim) of states, with its memory."""
+        return self._observe(qpos, qvel, action, self.memory)
+
+    def _observe(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
         if self.task.ground is not None:
             qpos = self.task.ground.lower(qpos)
-        return self.task.observe_with(qpos, qvel, action, self.memory)
+        return self.task.observe_with(qpos, qvel, action, memory)
 
     def state_dict(self) -> dict[str, Any]:
         """Return a dictionary that continues the episodes exactly, without the simulator's factors and forces."""

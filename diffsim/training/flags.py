@@ -64,6 +64,8 @@ class Flags:
     """simulation steps per control step (per task, --contact and --accuracy)"""
     implicit: bool = False
     """on soft contact, damping and friction act at the end of a substep (per task and --accuracy)"""
+    compile: bool = False
+    """fuse torch's operations with torch.compile: on a GPU shorter iterations, a longer start (docs/performance.md)"""
     threads: Natural = 0
     """CPU threads of the simulator; they do not change results (0: chosen by the amount of work)"""
 

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from diffsim.training import distributed
 from diffsim.training.errors import fail
 
+# The kernel takes 65,536 numbers of a tensor in one block of threads: on a GPU more tensors keep more of it busy.
+PARTS = 32
 PLAIN: dict[str, Any] = dict(weight_decay=0.0, eps=1e-8, amsgrad=False, maximize=False)  # torch.optim.Adam's defaults
 
 
@@ -85,8 +87,12 @@ class ClippedAdam:
 
     def _update(self, gradient: Tensor, **scaled: Any) -> None:
         """Apply Adam along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
-        state: tuple[list[Tensor], ...] = [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]
-        torch._fused_adam_([self.vector], [gradient], *state, **self._adam | scaled)
+        parts = PARTS if gradient.is_cuda else 1
+        vector, grads, avgs, squares = (
+            x.tensor_split(parts) for x in (self.vector, gradient, self.exp_avg, self.exp_avg_sq)
+        )
+        steps = [self.step_count] * parts
+        torch._fused_adam_(vector, grads, avgs, squares, [], steps, **self._adam | scaled)
 
     def moments(self, parameter: Tensor) -> list[Tensor]:
         """Views of a parameter's moments (numel,), first and second."""

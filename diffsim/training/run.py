@@ -104,6 +104,7 @@ class Run:
         self._variation: Any = None
         self._samples = 0  # control steps of an iteration, of all ranks
         self._learner: Learner | None = None
+        self._compiled: list[DiffEnv | nn.Module] = []
         self._normalizers: list[ObsNormalizer] = []  # of observations
         self._log: ProgressLog | None = None
         self._records: list[Record] = []
@@ -187,6 +188,8 @@ class Run:
 
         See graph.capture.
         """
+        if self.args.compile:
+            self._compile(env)
         call = graph.capture(function, self.device, env) if self.graphs and not eager else function
 
         def timed() -> Metrics:
@@ -196,10 +199,21 @@ class Run:
             except ActionError:
                 self._check_learner()  # they say more
                 raise
+            except Exception as error:
+                if self.args.compile and type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+                    fail(f"--compile: torch.compile failed, train without it: {str(error).strip().splitlines()[0]}")
+                raise
             self._times[f"time/{function.__name__}"] = begin, Mark(self.device)
             return metrics
 
         return timed
+
+    def _compile(self, env: DiffEnv | None) -> None:
+        """Compile the environment's step and the learner's networks, each once."""
+        for part in (env, *vars(self._learner).values()):
+            if isinstance(part, DiffEnv | nn.Module) and part not in self._compiled:
+                self._compiled.append(part)
+                part.compile(**({"dynamic": False} if isinstance(part, nn.Module) else {}))
 
     # Iterating -------------------------------------------------------------------------------------------------------
 
