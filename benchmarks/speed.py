@@ -2,6 +2,7 @@
 
     python benchmarks/speed.py                                every task on a core, 64 and 256 environments
     python benchmarks/speed.py --device cuda --parts scaling --env ant    64 to 65,536 environments, as CUDA graphs
+    python benchmarks/speed.py --parts iteration --env ant humanoid       learners' iterations, and what they launch
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
 A machine that does something else meanwhile gives wrong numbers.
@@ -9,12 +10,17 @@ A machine that does something else meanwhile gives wrong numbers.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import gc
+import importlib
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from statistics import median
 from typing import Annotated, Any, Literal
 
@@ -22,20 +28,27 @@ import mujoco
 import torch
 import tyro
 from common import TASKS, CommonFlags, Panel, Part, TaskName, lines, measured, plot, run
-from tables import Row
+from tables import ROOT, Row
 
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.extra.terrain import rough
 from diffsim.extra.tune.front import clock
 from diffsim.sim.launcher import TooLargeError
-from diffsim.training import Count, fail, graph
+from diffsim.training import Count, Run, fail, graph
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 TECHNIQUES = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"
-PartName = Literal["physics", "scaling"]
+PartName = Literal["physics", "scaling", "iteration"]
 SCALING = (64, 256, 1024, 4096, 16384, 65536)  # environments of the scaling table, at a horizon of 32
 HORIZONS = (1, 4, 8, 16, 32, 64, 128)  # its horizons, at 64 environments
+ITERATIONS = {  # what the iteration's table measures on a GPU: learner, environments, horizon
+    "ant": (("shac", 64, 32), ("shac", 4096, 32), ("ppo_baseline", 4096, 32)),
+    "humanoid": (("sapo", 1024, 32),),
+    "g1": (("sapo", 1024, 16),),
+    "go2": (("shac", 1024, 8), ("ppo_baseline", 4096, 32)),
+}
+ON_CPU = dict.fromkeys(("ant", "humanoid"), (("shac", 64, 32),))
 
 
 @dataclass
@@ -209,6 +222,62 @@ def scaling_row(device: str, name: TaskName, num_envs: int, horizon: int, techni
     return row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30}
 
 
+# Iterations ----------------------------------------------------------------------------------------------------------
+
+
+class Measured(Run):
+    """A run that stops after some iterations, and counts what the second one launches on a GPU."""
+
+    stop_after = 40
+    launches = 0
+
+    def capture(self, function: Any, env: Any = None, eager: bool = False) -> Any:
+        calls = 0
+
+        def counted() -> Any:
+            nonlocal calls
+            calls += 1
+            if calls != 2 or self.device.type == "cpu":
+                return function()
+            with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+                result = function()
+                torch.cuda.synchronize(self.device)
+            kinds = [event.device_type for event in profile.events() or ()]
+            Measured.launches += kinds.count(torch.autograd.DeviceType.CUDA)
+            return result
+
+        counted.__name__ = function.__name__
+        return super().capture(counted, env, eager)
+
+
+def measure_iteration(args: Args, name: TaskName | Robot) -> Iterator[Row]:
+    """Whole iterations of learners, from rollout to critic: eager, as one CUDA graph, and with --compile."""
+    cuda = args.device != "cpu"
+    for learner, num_envs, horizon in (ITERATIONS if cuda else ON_CPU).get(name, ()):
+        for technique in ("eager", "graph", "compiled") if cuda else ("eager",):
+            row: Row = {"task": name, "learner": learner, "environments": num_envs, "horizon": horizon}
+            yield {**row, "technique": technique, **iteration(args.device, name, learner, num_envs, horizon, technique)}
+
+
+def iteration(device: str, name: str, learner: str, num_envs: int, horizon: int, technique: str) -> Row:
+    """Milliseconds of the median iteration, what it launches, and seconds until the first one has ended."""
+    script: Any = importlib.import_module(learner)
+    Measured.graphs, Measured.launches, script.Run = technique != "eager", 0, Measured
+    with tempfile.TemporaryDirectory() as folder:
+        flags = (
+            f"--env {name} --num-envs {num_envs} --horizon {horizon} --device {device} --run-dir {folder}/run --quiet"
+        )
+        start = time.perf_counter()
+        script.main([*flags.split(), "--eval-every", "0", *(["--compile"] if technique == "compiled" else [])])
+        seconds = time.perf_counter() - start
+        with (Path(folder) / "run" / "progress.csv").open() as file:
+            times = [float(row["time_total"]) for row in csv.DictReader(file)]
+    graph.release()
+    gc.collect()
+    usual = median(times[len(times) // 4 :])
+    return {"ms": 1e3 * usual, "launches": Measured.launches, "start (s)": seconds - sum(times[1:])}
+
+
 def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     """Microseconds of one differentiated control step of one environment, against environments and horizon."""
     panels, unit, speed = list[Panel](), "us per control step, forward + backward", "differentiated control steps/s"
@@ -222,13 +291,21 @@ def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
 PARTS: dict[PartName, Part] = {
     "physics": Part("speed_physics", measure_physics, ("task", "environments", "scene", "kernel", "device")),
     "scaling": Part("speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique")),
+    "iteration": Part(
+        "speed_iteration",
+        measure_iteration,
+        ("task", "learner", "environments", "technique"),
+        "speed_iteration",
+        "performance.md",
+    ),
 }
 
 
 def main(args: Args) -> None:
     robots = [name for name in args.env if name not in TASKS]
-    if robots and args.parts != ("physics",):
-        fail(f"--env {' '.join(robots)}: measured by --parts physics alone")
+    if robots and "scaling" in args.parts:
+        fail(f"--env {' '.join(robots)}: not measured by --parts scaling")
+    sys.path.insert(0, str(ROOT))  # of the learners
     for part in args.parts:
         rows = measured(args, PARTS[part])
         if part == "scaling" and rows:

@@ -84,8 +84,8 @@ def module_options(spec: KernelSpec) -> dict[str, Any]:
     # On the CPU unrolling buys no speed and costs a second of compilation; a GPU keeps small matrices in registers.
     options: dict[str, Any] = {"enable_backward": False, "max_unroll": 6 if spec.env_last else 1}
     if spec.env_last and spec.constrained and spec.dtype is wp.float32:
-        # A quarter of a GPU's time. Newton's method corrects what fast divisions and square roots round; the explicit
-        # steps of soft contact would err ten times as much (docs/performance.md).
+        # A fifth of a GPU's time. Newton's method corrects what fast divisions and square roots round: states of a G1
+        # err as much as without. Those of an ant on soft contact would err ten times as much.
         options["fast_math"] = True
     if not spec.env_last:
         options["block_dim"] = 1  # as Warp launches on a CPU: for its default of 256 it would hash the module once more
