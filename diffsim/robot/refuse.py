@@ -67,6 +67,18 @@ def obstacles(m: mujoco.MjModel) -> list[str]:
     return lines
 
 
+def strays(m: mujoco.MjModel) -> list[str]:
+    """Name the bodies below the world that obstruct the robot's simulation, but move by themselves and touch nothing.
+
+    They are those beside a floating robot, and free ones beside any robot, if no tendon or equality ties them to it.
+    """
+    root, free = m.body_rootid[m.jnt_bodyid], m.jnt_type == Joint.mjJNT_FREE
+    if not m.njnt or m.neq or m.ntendon:
+        return []
+    alone = np.unique(root[(root != root[0]) & (free | free[0]) & ~_touching(m)[root]])
+    return [name for body in alone.tolist() if (name := m.body(body).name)]
+
+
 def beyond(scene: Scene) -> list[str]:
     """Return such a line for arrays that are not finite in the kernels' single precision."""
     names = []
@@ -113,10 +125,17 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
         second[others] = m.body_rootid[others] != m.body_rootid[m.jnt_bodyid[0]]
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
-    yield "body", m.body_mocapid >= 0, "mocap is not simulated"
+    yield "body", (m.body_mocapid >= 0) & _touching(m), f"contact of a mocap body is not simulated{ONLY_DRAWN}"
     yield "body", second, "a second base besides a floating one; remove its joints and their actuators"
     yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
     yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
+
+
+def _touching(m: mujoco.MjModel) -> Mask:
+    """Mark bodies below the world that have, or carry, a geom that may touch another one."""
+    geoms = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+    geoms[[*m.pair_geom1, *m.pair_geom2]] = True
+    return np.isin(range(m.nbody), m.body_rootid[m.geom_bodyid[geoms]])
 
 
 def _joints(m: mujoco.MjModel) -> Iterator[Row]:

@@ -139,6 +139,7 @@ class Scene:
     density: float = 0.0  # kg/m^3, of the fluid around the robot
     viscosity: float = 0.0  # kg/(m s)
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
+    left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
 
     @property

@@ -12,7 +12,7 @@ import speed
 import torch
 import transfer
 from common import Panel, lines, parse
-from scenes import BOUNDED_SERVOS, pendulum
+from scenes import BOUNDED_SERVOS, pendulum, robot
 from tables import markdown, read_csv
 
 import diffsim
@@ -92,27 +92,42 @@ def test_gradients_on_each_ground(tmp_path: Path) -> None:
     assert all(abs(float(row["cosine"])) <= 1 for row in rows) and float(rows[0]["differences"]) > 0.99
 
 
+SHELL = '<asset><mesh name="shell" file="shell.stl"/></asset>'
+
 # Robots of others -----------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With a step in contact and one with a rough shape; an absent mesh has a stand-in if it is only drawn."""
+    shell = '<geom type="mesh" mesh="shell" contype="0" conaffinity="0" mass="0"/>'
+    rock = robot('<body><freejoint/><geom type="cylinder" size=".1 .1"/></body>')
     robots = {
         "servos": BOUNDED_SERVOS,
         "rubbed": pendulum('axis="0 1 0" frictionloss="1"'),
+        "ball": robot(f'<body><freejoint/><geom size=".1"/>{shell}</body>', SHELL),
+        "rough": rock,
         "bad": pendulum(rest='<actuator><velocity joint="hinge" kv="-2"/></actuator>'),
+        "solid": robot(f"<body><freejoint/>{shell.replace('contype', 'group')}</body>", SHELL),
     }
     for name, mjcf in robots.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.xml").write_text(mjcf)
     flags = ["--states", "8", "--output", str(tmp_path / "out")]
     foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
-    assert "2 of 3 load" in capsys.readouterr().out
-    rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
+    out = capsys.readouterr().out
+    assert "4 of 6 load" in out and "steps of 4 equal MuJoCo's to 1e-06, 1 of them with contact" in out
+    assert "nothing is told of 0 others" in out
+    assert "1 refused, actuator: stiffness and damping of a servo must not be negative (bad)" in out
+    rows = {row["file"].partition("/")[0]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
     bad = "actuator number 0: stiffness and damping of a servo must not be negative"
-    assert rows["bad/scene.xml"]["refused"] == bad
-    for name in ("servos", "rubbed"):
-        assert rows[f"{name}/scene.xml"]["refused"] == ""
-        assert float(rows[f"{name}/scene.xml"]["relative error of qacc"]) < 1e-9
+    assert rows["bad"]["refused"] == bad and "Error opening file" in rows["solid"]["refused"]
+    for name in ("servos", "rubbed", "ball", "rough"):
+        assert rows[name]["refused"] == ""
+        assert float(rows[name]["relative error of qacc"]) < 1e-9 and float(rows[name]["step"]) < 1e-9
+        assert float(rows[name]["states"]) == foreign.STEPS
+    assert rows["ball"]["absent meshes"] == "1" and rows["ball"]["with contact"] == "16"
+    assert rows["rough"]["with contact"] == "0" and 0 < float(rows["rough"]["step of told contacts"]) < 1
+    assert "8 of each rim of a cylinder" in rows["rough"]["told"]
 
 
 # Speed ----------------------------------------------------------------------------------------------------------------

@@ -75,9 +75,11 @@ REFUSED = {  # what the variants of test_variants.py have not
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),
     "body 'post': a second base besides a floating one; remove its joints and their actuators": robot(
-        f'<body><freejoint/>{BALL}</body><body name="post"><joint/>{BALL}</body>'
+        f'<body><freejoint/>{BALL}</body><body name="post"><joint/>{BALL}</body>'  # which the robot can touch
     ),
-    "body 'hand': mocap is not simulated": pendulum(world=f'{FLOOR}<body name="hand" mocap="true"/>'),
+    "body 'hand': contact of a mocap body is not simulated; set contype and conaffinity to 0 if only drawn": pendulum(
+        world=f'<body name="hand" mocap="true">{BALL}</body>'
+    ),
     "body 'fin': in a fluid each body needs a joint; merge its geoms": pendulum(
         inside=f'<body name="fin">{BALL}</body>', rest='<option density="1"/>'
     ),
