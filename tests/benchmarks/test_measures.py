@@ -115,8 +115,8 @@ def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[
     flags = ["--states", "8", "--output", str(tmp_path / "out")]
     foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
     out = capsys.readouterr().out
-    assert "4 of 6 load" in out and "steps of 4 equal MuJoCo's to 1e-06, 1 of them with contact" in out
-    assert "nothing is told of 0 others" in out
+    assert "4 of 6 load" in out and "steps of 4 equal MuJoCo's to 1e-06, 2 of them with contact" in out
+    assert "steps of 4 equal those of a solver that converges" in out and "nothing is told of 0 others" in out
     assert "1 refused, actuator: stiffness and damping of a servo must not be negative (bad)" in out
     rows = {row["file"].partition("/")[0]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
     bad = "actuator number 0: stiffness and damping of a servo must not be negative"
