@@ -10,7 +10,7 @@ compares a step of the file as it stands: its timestep, cone, integrator, contac
 from __future__ import annotations
 
 import copy
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import cycle, islice
@@ -172,6 +172,19 @@ def step_errors(scene: Scene) -> dict[str, object]:
     return row
 
 
+def outcome(row: dict[str, object]) -> str:
+    """Sum up a row: refused, loaded (nothing is compared), equal on or off the ground, equal only if MuJoCo's solver
+    converges, or else whether the report tells why.
+    """
+    if row["refused"] or not row.get("step"):
+        return "refused" if row["refused"] else "loaded"
+    if float(str(row["step"])) < EQUAL:
+        return "equal on the ground" if row["with contact"] else "equal off the ground"
+    if float(str(row["converged"])) < EQUAL:
+        return "equal if converged"
+    return "told" if row["told"] else "silent"
+
+
 def main(args: Args) -> None:
     folder, collection = args.folder.resolve(), args.folder.absolute().name  # meshes may lie beside the folder
     rows, robots = list[dict[str, object]](), defaultdict[str, list[str]](list)
@@ -190,20 +203,13 @@ def main(args: Args) -> None:
             row["refused"] = " ".join(lines[:2])
             for line in lines[len(lines) > 1 :]:
                 robots[f"{line.split()[0]}: {line.rpartition(': ')[2]}"].append(file.parts[0])
+        row["outcome"] = outcome(row)
         rows.append(row)
         args.keep("foreign", row, ("collection", "file"))
     for reason, refused in robots.items():
         print(f"{len(refused)} refused, {reason} ({', '.join(dict.fromkeys(refused))})")
-    load = [row for row in rows if not row["refused"]]
-    equal, converged = (
-        [row for row in load if float(str(row.get(name) or "nan")) < EQUAL] for name in ("step", "converged")
-    )
-    silent = [str(row["file"]) for row in load if row not in equal and row.get("step") and not row["told"]]
-    touching = sum(bool(row["with contact"]) for row in equal)
-    print(f"{len(load)} of {len(rows)} load: {args.csv('foreign')}")
-    print(f"steps of {len(equal)} equal MuJoCo's to {EQUAL:g}, {touching} of them with contact")
-    print(f"steps of {len(converged)} equal those of a solver that converges")
-    print(f"nothing is told of {len(silent)} others: {', '.join(silent)}")
+    counts = Counter(row["outcome"] for row in rows)
+    print(f"{len(rows)} files: {', '.join(f'{number} {word}' for word, number in counts.items())}")
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", 
 UNLIMITED, UNNAMED = {"lower", "upper", "force_low", "force_high"}, PENALTY_CONSTANTS
 
 # Arrays of MuJoCo's model that must be 0, of which only newer versions have some, finite, and not negative
-ZERO = """eq_active0 geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_dampingpoly pair_adhesion
+ZERO = """geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_dampingpoly pair_adhesion
     pair_solreffriction tendon_stiffness tendon_stiffnesspoly tendon_damping tendon_dampingpoly tendon_limited
     tendon_frictionloss tendon_armature tendon_actfrclimited tendon_springyield actuator_damping actuator_dampingpoly
     actuator_armature actuator_delay""".split()
@@ -46,11 +46,13 @@ FINITE = """geom_friction geom_margin geom_gap geom_solmix geom_solref geom_soli
     pair_solref pair_solimp jnt_margin jnt_solref jnt_solimp dof_solref dof_solimp""".split()
 POSITIVE = "jnt_stiffness dof_armature dof_damping dof_frictionloss geom_friction geom_solmix pair_friction".split()
 # What a file calls them, where that is another word
-WORDS = {"active0": "this constraint", "limited": "range", "actfrclimited": "actuatorfrcrange"}
+WORDS = {"limited": "range", "actfrclimited": "actuatorfrcrange"}
 WORDS |= {"stiffnesspoly": "a second number of stiffness", "dampingpoly": "a second number of damping"}
-ELEMENTS = {"eq": "equality", "jnt": "joint", "dof": "joint"}
+ELEMENTS = {"jnt": "joint", "dof": "joint"}
 ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
+WITHOUT_EQUALITY = 'remove it, or all of them by <flag equality="disable"/>'
+ALONE = "or, if it touches nothing, set contype and conaffinity of its geoms to 0"
 ONLY_DRAWN = "; set contype and conaffinity to 0 if only drawn"
 
 
@@ -101,6 +103,9 @@ def _file(m: mujoco.MjModel) -> Iterator[Row]:
     yield "numeric", wrong, "must be one number, not negative"
     yield "file", ["without a joint"] * (not m.njnt), "there is nothing to simulate"
     yield "flex", np.ones(m.nflex), "deformable bodies are not simulated"
+    for name, kind in mujoco.mjtEq.__members__.items():
+        word = name.removeprefix("mjEQ_").lower()
+        yield "equality", (m.eq_active0 != 0) & (m.eq_type == kind), f"{word} is not simulated; {WITHOUT_EQUALITY}"
     yield "plugin", np.ones(m.nplugin), "plugins are not simulated"
 
 
@@ -126,7 +131,7 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
     yield "body", (m.body_mocapid >= 0) & _touching(m), f"contact of a mocap body is not simulated{ONLY_DRAWN}"
-    yield "body", second, "a second base besides a floating one; remove its joints and their actuators"
+    yield "body", second, f"a second base besides a floating one; remove its joints and their actuators, {ALONE}"
     yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
     yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
 
@@ -151,7 +156,7 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     yield "joint", bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
     yield "joint", free & (m.jnt_stiffness != 0), "a free joint has no stiffness here; write <freejoint/>"
     yield "joint", free & armature & fluid, "armature of a free joint in a fluid is not simulated"
-    yield "joint", free & ~first, "one free joint, of the first moving body, is simulated"
+    yield "joint", free & ~first, f"one free joint, of the first moving body, is simulated; remove this one, {ALONE}"
 
 
 def _inertia(m: mujoco.MjModel) -> Iterator[Row]:

@@ -61,7 +61,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "joint 'j': actuatorgravcomp within actuatorfrcrange is not simulated": robot(
         f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BALL}</body>'
     ),
-    "joint 'loose': one free joint, of the first moving body, is simulated": robot(
+    "joint 'loose': one free joint, of the first moving body, is simulated; remove this one, or, if it": robot(
         f'<body><joint/>{BALL}</body><body><freejoint name="loose"/>{BALL}</body>'
     ),
     "joint 'weak': actuatorfrcrange together with muscles is not simulated": tendon(
@@ -72,6 +72,13 @@ REFUSED = {  # what the variants of test_variants.py have not
         robot(f'<body><joint name="a" type="slide"/><joint name="b" type="slide"/>{BALL}</body>'),
         slides("1e-8"),
     ],
+    # equality
+    "equality 'loop': connect is not simulated; remove it, or all of them by <flag equality=\"disable\"/>": pendulum(
+        rest='<equality><connect name="loop" body1="arm" anchor="0 0 0"/></equality>'
+    ),
+    "equality 'mimic': joint is not simulated": pendulum(
+        rest='<equality><joint name="mimic" joint1="hinge"/></equality>'
+    ),
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),
     "body 'post': a second base besides a floating one; remove its joints and their actuators": robot(
