@@ -52,6 +52,7 @@ ELEMENTS = {"jnt": "joint", "dof": "joint"}
 ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
 WITHOUT_EQUALITY = 'remove it, or all of them by <flag equality="disable"/>'
+SECOND = "next to a floating robot no other body has joints, and next to any robot no other one is free"
 ALONE = "or, if it touches nothing, set contype and conaffinity of its geoms to 0"
 ONLY_DRAWN = "; set contype and conaffinity to 0 if only drawn"
 
@@ -70,15 +71,9 @@ def obstacles(m: mujoco.MjModel) -> list[str]:
 
 
 def strays(m: mujoco.MjModel) -> list[str]:
-    """Name the bodies below the world that obstruct the robot's simulation, but move by themselves and touch nothing.
-
-    They are those beside a floating robot, and free ones beside any robot, if no tendon or equality ties them to it.
-    """
-    root, free = m.body_rootid[m.jnt_bodyid], m.jnt_type == Joint.mjJNT_FREE
-    if not m.njnt or m.neq or m.ntendon:
-        return []
-    alone = np.unique(root[(root != root[0]) & (free | free[0]) & ~_touching(m)[root]])
-    return [name for body in alone.tolist() if (name := m.body(body).name)]
+    """Name bodies beside the robot that touch nothing, if the file has no tendon or equality that could tie them."""
+    alone = np.flatnonzero(_others(m) & ~_touching(m)).tolist()
+    return [name for body in alone if (name := m.body(body).name) and not m.neq and not m.ntendon]
 
 
 def beyond(scene: Scene) -> list[str]:
@@ -124,16 +119,18 @@ def _numbers(m: mujoco.MjModel) -> Iterator[Row]:
 
 
 def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
-    second = np.zeros(m.nbody, bool)
-    if (m.jnt_type == Joint.mjJNT_FREE)[:1].any():
-        others = m.jnt_bodyid[m.jnt_type != Joint.mjJNT_FREE]
-        second[others] = m.body_rootid[others] != m.body_rootid[m.jnt_bodyid[0]]
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
     yield "body", (m.body_mocapid >= 0) & _touching(m), f"contact of a mocap body is not simulated{ONLY_DRAWN}"
-    yield "body", second, f"a second base besides a floating one; remove its joints and their actuators, {ALONE}"
+    yield "body", _others(m), f"{SECOND}; remove its joints and their actuators, {ALONE}"
     yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
     yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
+
+
+def _others(m: mujoco.MjModel) -> Mask:
+    """Mark bodies below the world that have joints, beside a floating robot, or a free joint, beside any."""
+    root, free = m.body_rootid[m.jnt_bodyid], m.jnt_type == Joint.mjJNT_FREE
+    return np.isin(range(m.nbody), root[(root != root[:1]) & (free | free[:1])])
 
 
 def _touching(m: mujoco.MjModel) -> Mask:
@@ -148,7 +145,6 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
     armature = m.dof_armature[m.jnt_dofadr] != 0
     fluid = m.opt.density + m.opt.viscosity > 0
-    first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     tendons = (m.actuator_trntype == Transmission.mjTRN_TENDON).any()
     yield "joint", ball & limited, "the limit of a ball joint is not simulated"
     yield "joint", limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
@@ -156,7 +152,6 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     yield "joint", bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
     yield "joint", free & (m.jnt_stiffness != 0), "a free joint has no stiffness here; write <freejoint/>"
     yield "joint", free & armature & fluid, "armature of a free joint in a fluid is not simulated"
-    yield "joint", free & ~first, f"one free joint, of the first moving body, is simulated; remove this one, {ALONE}"
 
 
 def _inertia(m: mujoco.MjModel) -> Iterator[Row]:

@@ -79,9 +79,9 @@ def test_bodies_beside_a_robot_that_touch_nothing_are_left_out():
     solid = text.replace(ghost, '<geom size="0.1"/>')
     tied = text.replace("</mujoco>", '<tendon><fixed><joint joint="unused" coef="1"/></fixed></tendon></mujoco>')
     for bad in (solid, tied):
-        with pytest.raises(SceneError, match="'post'.*a second base besides a floating one"):
+        with pytest.raises(SceneError, match="'post'.*next to a floating robot no other body has joints"):
             parse(bad)
-    with pytest.raises(SceneError, match="a second base besides a floating one"):
+    with pytest.raises(SceneError, match="next to a floating robot no other body has joints"):
         load_scene(full)  # of which nothing can be removed
 
 

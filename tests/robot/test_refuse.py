@@ -61,9 +61,6 @@ REFUSED = {  # what the variants of test_variants.py have not
     "joint 'j': actuatorgravcomp within actuatorfrcrange is not simulated": robot(
         f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BALL}</body>'
     ),
-    "joint 'loose': one free joint, of the first moving body, is simulated; remove this one, or, if it": robot(
-        f'<body><joint/>{BALL}</body><body><freejoint name="loose"/>{BALL}</body>'
-    ),
     "joint 'weak': actuatorfrcrange together with muscles is not simulated": tendon(
         joint='<joint name="weak" actuatorfrcrange="-1 1"/>', actuator=MUSCLES
     ),
@@ -81,9 +78,10 @@ REFUSED = {  # what the variants of test_variants.py have not
     ),
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),
-    "body 'post': a second base besides a floating one; remove its joints and their actuators": robot(
-        f'<body><freejoint/>{BALL}</body><body name="post"><joint/>{BALL}</body>'  # which the robot can touch
-    ),
+    "body 'post': next to a floating robot no other body has joints, and next to any robot no other one is free; ": [
+        robot(f'<body>{base}{BALL}</body><body name="post">{joint}{BALL}</body>')  # which the robot can touch
+        for base, joint in (("<freejoint/>", "<joint/>"), ("<joint/>", "<freejoint/>"), ("<freejoint/>",) * 2)
+    ],
     "body 'hand': contact of a mocap body is not simulated; set contype and conaffinity to 0 if only drawn": pendulum(
         world=f'<body name="hand" mocap="true">{BALL}</body>'
     ),
