@@ -199,7 +199,7 @@ def main(args: Args) -> None:
                 row["relative error of qacc"] = flight_error(scene.mj_model, args.states)
                 row |= step_errors(scene)
         except SceneError as error:
-            lines = str(error).partition(": ")[2].split("\n  ")
+            lines = str(error).partition(": ")[2].replace(f"{path.parent}/", "").split("\n  ")
             row["refused"] = " ".join(lines[:2])
             for line in lines[len(lines) > 1 :]:
                 robots[f"{line.split()[0]}: {line.rpartition(': ')[2]}"].append(file.parts[0])

@@ -13,7 +13,7 @@ import torch
 import transfer
 from common import Panel, lines, parse
 from scenes import BOUNDED_SERVOS, pendulum, robot
-from tables import markdown, read_csv
+from tables import ROOT, markdown, read_csv
 
 import diffsim
 from diffsim.training.checkpoint import POLICIES
@@ -119,7 +119,7 @@ def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "1 refused, actuator: stiffness and damping of a servo must not be negative (bad)" in out
     rows = {row["file"].partition("/")[0]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
     bad = "actuator number 0: stiffness and damping of a servo must not be negative"
-    assert rows["bad"]["refused"] == bad and "Error opening file" in rows["solid"]["refused"]
+    assert rows["bad"]["refused"] == bad and rows["solid"]["refused"] == "Error: Error opening file 'shell.stl'"
     for name in ("servos", "rubbed", "ball", "rough"):
         assert rows[name]["refused"] == ""
         assert float(rows[name]["relative error of qacc"]) < 1e-9 and float(rows[name]["step"]) < 1e-9
@@ -127,6 +127,13 @@ def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert rows["ball"]["absent meshes"] == "1" and rows["ball"]["with contact"] == "16"
     assert rows["rough"]["outcome"] == "equal off the ground" and 0 < float(rows["rough"]["step of told contacts"]) < 1
     assert "8 of each rim of a cylinder" in rows["rough"]["told"]
+
+
+def test_no_recorded_difference_is_silent() -> None:
+    """docs/physics.md says so."""
+    rows = read_csv(ROOT / "results" / "cpu" / "foreign.csv")
+    assert rows and not [row["file"] for row in rows if row["outcome"] == "silent"]
+    assert not [row["file"] for row in rows if row["outcome"] == "told" and "Left out" not in row["told"]]
 
 
 @pytest.mark.parametrize(
