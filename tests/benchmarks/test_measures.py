@@ -130,7 +130,6 @@ def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_no_recorded_difference_is_silent() -> None:
-    """docs/physics.md says so."""
     rows = read_csv(ROOT / "results" / "cpu" / "foreign.csv")
     assert rows and not [row["file"] for row in rows if row["outcome"] == "silent"]
     assert not [row["file"] for row in rows if row["outcome"] == "told" and "Left out" not in row["told"]]
