@@ -662,6 +662,18 @@ def test_frictionless_contact_and_friction_of_zero():
         step(scene, states, dtype=torch.float32)
 
 
+@pytest.mark.parametrize(("dtype", "enough"), [(torch.float64, 1e-9), (torch.float32, 1e-5)])
+def test_a_turntable_in_the_ground_turns_as_in_mujoco(dtype, enough):
+    """A link that turns about its centre of mass has an inverse weight of zero."""
+    body = '<body><joint axis="0 0 1"/><geom size="0.1"/><body pos="0.3 0 0.3"><joint axis="0 1 0"/>'
+    body += '<geom type="capsule" size="0.02 0.1" contype="0" conaffinity="0"/></body></body>'
+    scene = parse(robot(body, world='<geom type="plane" size="1 1 1" pos="0 0 -0.08"/>'))
+    assert scene.mj_model.body_invweight0[1, 0] == 0
+    states = np.array([[0.4, 0.3]]), np.array([[2.0, -1.0]]), np.zeros((1, 0))
+    sim_qvel = step(scene, states, dtype=dtype, tolerance=1e-6 if dtype == torch.float32 else TOLERANCE)[1]
+    np.testing.assert_allclose(sim_qvel, in_mujoco(scene, *states)[1], atol=enough)
+
+
 def test_float32_keeps_the_zone_of_a_deep_contact(monkeypatch) -> None:
     """Feet deep in the ground are so stiff that rounding moves a contact over the edge of its cone. The gradient takes
     the zone in which the step was solved: with another one it was up to 1e5 times too large."""

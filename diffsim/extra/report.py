@@ -68,7 +68,17 @@ def _parts(scene: Scene) -> Iterator[str]:
 
 def approximations(scene: Scene) -> tuple[str, ...]:
     """Return a sentence for each approximation."""
-    return tuple(sentence for check in (_self_contact, _ground, _actuators, _options) for sentence in check(scene))
+    checks = _bodies, _self_contact, _ground, _actuators, _options
+    return tuple(sentence for check in checks for sentence in check(scene))
+
+
+def _bodies(scene: Scene) -> Iterator[str]:
+    m = scene.mj_model
+    if scene.left_out:
+        yield f"Left out, with their actuators: bodies that touch nothing, {listed(map(repr, scene.left_out))}."
+    if m.nmocap:
+        names = listed(label(m, Kind.mjOBJ_BODY, body) for body in np.flatnonzero(m.body_mocapid >= 0).tolist())
+        yield f"Mocap bodies stay where the file has them: {names}."
 
 
 def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:

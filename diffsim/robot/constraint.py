@@ -18,6 +18,8 @@ from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, Sc
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
+# MuJoCo's bound of an inverse weight, 0 of a link that turns about its centre of mass; and one for single precision
+LEAST_WEIGHT, LEAST_WEIGHT_SINGLE = 1e-15, 1e-7
 MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precision still holds
 LEAST_SOFTNESS = 1e-6  # of a pyramid's edges, at which Newton's method fails in single precision
 
@@ -80,6 +82,7 @@ def _contact(scene: Scene, ground: int, geom: int, fastest: float, single: bool)
     m = scene.mj_model
     law = pair_law(m, ground, geom)
     weight = m.body_invweight0[m.geom_bodyid[[ground, geom]], 0].sum()
+    weight = max(weight, LEAST_WEIGHT_SINGLE if single else LEAST_WEIGHT)
     friction = max(law.friction, LEAST_FRICTION) if law.condim > 1 else 0.0
     numbers = _numbers(law.solref, law.solimp, weight, law.margin, fastest)
     numbers[2:4] = friction, 1 / m.opt.impratio

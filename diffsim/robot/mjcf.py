@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from diffsim.robot.contact import contact_points, ground_pairs
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, numeric, servos
-from diffsim.robot.refuse import beyond, obstacles
+from diffsim.robot.refuse import beyond, obstacles, strays
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
 
 Geom = mujoco.mjtGeom
@@ -25,10 +26,9 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     Raises:
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
     """
-    if isinstance(path, mujoco.MjSpec):
-        path = path.compile()
-    if isinstance(path, mujoco.MjModel):
-        file, model = Path(path.names.partition(b"\0")[0].decode()), copy.copy(path)
+    if isinstance(path, mujoco.MjModel | mujoco.MjSpec):
+        model = path.compile() if isinstance(path, mujoco.MjSpec) else copy.copy(path)
+        file = Path(model.names.partition(b"\0")[0].decode())
     elif (file := Path(path)).is_file():
         try:
             model = mujoco.MjModel.from_xml_path(str(file))
@@ -36,9 +36,14 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
             raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
     else:
         raise SceneError(f"robot file {str(path)!r} does not exist")
+    if left_out := [] if isinstance(path, mujoco.MjModel) else strays(model):
+        spec = path.copy() if isinstance(path, mujoco.MjSpec) else mujoco.MjSpec.from_file(str(file))
+        for body in left_out:
+            spec.delete(spec.body(body))  # with its joints, their actuators and numbers of keyframes
+        model = spec.compile()
     _obey_flags(model)
     _refuse(file, obstacles(model))
-    scene = _Reader(model, file).scene()
+    scene = dataclasses.replace(_Reader(model, file).scene(), left_out=tuple(left_out))
     _refuse(file, beyond(scene))
     return scene
 

@@ -38,7 +38,7 @@ EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", 
 UNLIMITED, UNNAMED = {"lower", "upper", "force_low", "force_high"}, PENALTY_CONSTANTS
 
 # Arrays of MuJoCo's model that must be 0, of which only newer versions have some, finite, and not negative
-ZERO = """eq_active0 geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_dampingpoly pair_adhesion
+ZERO = """geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_dampingpoly pair_adhesion
     pair_solreffriction tendon_stiffness tendon_stiffnesspoly tendon_damping tendon_dampingpoly tendon_limited
     tendon_frictionloss tendon_armature tendon_actfrclimited tendon_springyield actuator_damping actuator_dampingpoly
     actuator_armature actuator_delay""".split()
@@ -47,11 +47,14 @@ FINITE = """body_pos body_quat geom_friction geom_margin geom_gap geom_solmix ge
     dof_frictionloss""".split()
 POSITIVE = "jnt_stiffness dof_armature dof_damping dof_frictionloss geom_friction geom_solmix pair_friction".split()
 # What a file calls them, where that is another word
-WORDS = {"active0": "this constraint", "limited": "range", "actfrclimited": "actuatorfrcrange"}
+WORDS = {"limited": "range", "actfrclimited": "actuatorfrcrange"}
 WORDS |= {"stiffnesspoly": "a second number of stiffness", "dampingpoly": "a second number of damping"}
-ELEMENTS = {"eq": "equality", "jnt": "joint", "dof": "joint"}
+ELEMENTS = {"jnt": "joint", "dof": "joint"}
 ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
+WITHOUT_EQUALITY = 'remove it, or all of them by <flag equality="disable"/>'
+SECOND = "next to a floating robot no other body has joints, and next to any robot no other one is free"
+ALONE = "or, if it touches nothing, set contype and conaffinity of its geoms to 0"
 ONLY_DRAWN = "; set contype and conaffinity to 0 if only drawn"
 
 
@@ -66,6 +69,12 @@ def obstacles(m: mujoco.MjModel) -> list[str]:
             if which:
                 lines.append(f"{kind} {listed(which)}: {why}")
     return lines
+
+
+def strays(m: mujoco.MjModel) -> list[str]:
+    """Name bodies beside the robot that touch nothing, if the file has no tendon or equality that could tie them."""
+    alone = np.flatnonzero(_others(m) & ~_touching(m)).tolist()
+    return [name for body in alone if (name := m.body(body).name) and not m.neq and not m.ntendon]
 
 
 def beyond(scene: Scene) -> list[str]:
@@ -90,6 +99,9 @@ def _file(m: mujoco.MjModel) -> Iterator[Row]:
     yield "numeric", wrong, "must be one number, not negative"
     yield "file", ["without a joint"] * (not m.njnt), "there is nothing to simulate"
     yield "flex", np.ones(m.nflex), "deformable bodies are not simulated"
+    for name, kind in mujoco.mjtEq.__members__.items():
+        word = name.removeprefix("mjEQ_").lower()
+        yield "equality", (m.eq_active0 != 0) & (m.eq_type == kind), f"{word} is not simulated; {WITHOUT_EQUALITY}"
     yield "plugin", np.ones(m.nplugin), "plugins are not simulated"
 
 
@@ -108,16 +120,25 @@ def _numbers(m: mujoco.MjModel) -> Iterator[Row]:
 
 
 def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
-    second = np.zeros(m.nbody, bool)
-    if (m.jnt_type == Joint.mjJNT_FREE)[:1].any():
-        others = m.jnt_bodyid[m.jnt_type != Joint.mjJNT_FREE]
-        second[others] = m.body_rootid[others] != m.body_rootid[m.jnt_bodyid[0]]
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
-    yield "body", m.body_mocapid >= 0, "mocap is not simulated"
-    yield "body", second, "a second base besides a floating one; remove its joints and their actuators"
+    yield "body", (m.body_mocapid >= 0) & _touching(m), f"contact of a mocap body is not simulated{ONLY_DRAWN}"
+    yield "body", _others(m), f"{SECOND}; remove its joints and their actuators, {ALONE}"
     yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
     yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
+
+
+def _others(m: mujoco.MjModel) -> Mask:
+    """Mark bodies below the world that have joints, beside a floating robot, or a free joint, beside any."""
+    root, free = m.body_rootid[m.jnt_bodyid], m.jnt_type == Joint.mjJNT_FREE
+    return np.isin(range(m.nbody), root[(root != root[:1]) & (free | free[:1])])
+
+
+def _touching(m: mujoco.MjModel) -> Mask:
+    """Mark bodies below the world that have, or carry, a geom that may touch another one."""
+    geoms = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+    geoms[[*m.pair_geom1, *m.pair_geom2]] = True
+    return np.isin(range(m.nbody), m.body_rootid[m.geom_bodyid[geoms]])
 
 
 def _joints(m: mujoco.MjModel) -> Iterator[Row]:
@@ -125,7 +146,6 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
     armature = m.dof_armature[m.jnt_dofadr] != 0
     fluid = m.opt.density + m.opt.viscosity > 0
-    first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     tendons = (m.actuator_trntype == Transmission.mjTRN_TENDON).any()
     yield "joint", ball & limited, "the limit of a ball joint is not simulated"
     yield "joint", limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
@@ -133,7 +153,6 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     yield "joint", bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
     yield "joint", free & (m.jnt_stiffness != 0), "a free joint has no stiffness here; write <freejoint/>"
     yield "joint", free & armature & fluid, "armature of a free joint in a fluid is not simulated"
-    yield "joint", free & ~first, "one free joint, of the first moving body, is simulated"
 
 
 def _inertia(m: mujoco.MjModel) -> Iterator[Row]:

@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffsim.robot.terrain import TerrainError, check_terrain
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
@@ -30,10 +32,6 @@ FACTORS = (*PENALTY_CONSTANTS, "mass", "motor")
 
 class SceneError(ValueError):
     """Raised for an MJCF file that is missing, broken or not supported; names the element."""
-
-
-class TerrainError(ValueError):
-    """Raised for an invalid terrain, or one that the robot cannot have."""
 
 
 class RootCoordinates(NamedTuple):
@@ -139,6 +137,7 @@ class Scene:
     density: float = 0.0  # kg/m^3, of the fluid around the robot
     viscosity: float = 0.0  # kg/(m s)
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
+    left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
 
     @property
@@ -295,31 +294,4 @@ class Scene:
         """
         if not self.ncontact:
             raise TerrainError(f"{self.name} touches no ground, so it has no terrain")
-        return dataclasses.replace(self, terrain=_check_terrain(vertices), ground_height=0.0)
-
-
-def _check_terrain(vertices: ArrayLike) -> Array:
-    """Return profiles (M, K, 2) in float64, M = 1 for a single one; raises TerrainError if they are invalid."""
-    try:
-        profiles = np.array(vertices, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TerrainError("terrain must be numbers in an array (K, 2) or (environments, K, 2)") from error
-    shape = profiles.shape
-    profiles = profiles[None] if len(shape) == 2 else profiles
-    if profiles.ndim != 3 or profiles.shape[2] != 2 or profiles.shape[1] < 2 or not len(profiles):
-        raise TerrainError(f"terrain has shape {shape}, must be (K, 2) or (environments, K, 2) with K of 2 or more")
-    with np.errstate(invalid="ignore"):
-        along, up = np.moveaxis(np.diff(profiles, axis=1), 2, 0)
-    wall = (along == 0) & (up != 0)
-    wall[:, [0, -1]] = False  # it would go on for ever
-    wall[:, 1:] &= along[:, :-1] > 0
-    for good, must in (
-        ((np.abs(profiles) <= np.finfo(np.float32).max).all(2), "be finite"),
-        ((along > 0) | wall, "have a smaller x than the next one, or begin a wall, one alone and not at an end"),
-    ):
-        if not good.all():
-            row, vertex = np.argwhere(~good)[0]
-            where = f" of environment {row}" if len(profiles) > 1 else ""
-            x, z = profiles[row, vertex]
-            raise TerrainError(f"terrain: vertex {vertex}{where} ({x:g}, {z:g}) must {must}")
-    return profiles
+        return dataclasses.replace(self, terrain=check_terrain(vertices), ground_height=0.0)

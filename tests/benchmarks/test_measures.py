@@ -12,8 +12,8 @@ import speed
 import torch
 import transfer
 from common import Panel, lines, parse
-from scenes import BOUNDED_SERVOS, pendulum
-from tables import markdown, read_csv
+from scenes import BOUNDED_SERVOS, pendulum, robot
+from tables import ROOT, markdown, read_csv
 
 import diffsim
 from diffsim.training.checkpoint import POLICIES
@@ -92,27 +92,61 @@ def test_gradients_on_each_ground(tmp_path: Path) -> None:
     assert all(abs(float(row["cosine"])) <= 1 for row in rows) and float(rows[0]["differences"]) > 0.99
 
 
+SHELL = '<asset><mesh name="shell" file="shell.stl"/></asset>'
+
 # Robots of others -----------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With a step in contact and one with a rough shape; an absent mesh has a stand-in if it is only drawn."""
+    shell = '<geom type="mesh" mesh="shell" contype="0" conaffinity="0" mass="0"/>'
+    rock = robot('<body><freejoint/><geom type="cylinder" size=".1 .1"/></body>')
     robots = {
         "servos": BOUNDED_SERVOS,
         "rubbed": pendulum('axis="0 1 0" frictionloss="1"'),
+        "ball": robot(f'<body><freejoint/><geom size=".1"/>{shell}</body>', SHELL),
+        "rough": rock,
         "bad": pendulum(rest='<actuator><velocity joint="hinge" kv="-2"/></actuator>'),
+        "solid": robot(f"<body><freejoint/>{shell.replace('contype', 'group')}</body>", SHELL),
     }
     for name, mjcf in robots.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.xml").write_text(mjcf)
     flags = ["--states", "8", "--output", str(tmp_path / "out")]
     foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
-    assert "2 of 3 load" in capsys.readouterr().out
-    rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
+    out = capsys.readouterr().out
+    assert "6 files: 2 refused, 2 equal on the ground, 2 equal off the ground" in out
+    assert "1 refused, actuator: stiffness and damping of a servo must not be negative (bad)" in out
+    rows = {row["file"].partition("/")[0]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
     bad = "actuator number 0: stiffness and damping of a servo must not be negative"
-    assert rows["bad/scene.xml"]["refused"] == bad
-    for name in ("servos", "rubbed"):
-        assert rows[f"{name}/scene.xml"]["refused"] == ""
-        assert float(rows[f"{name}/scene.xml"]["relative error of qacc"]) < 1e-9
+    assert rows["bad"]["refused"] == bad and rows["solid"]["refused"] == "Error: Error opening file 'shell.stl'"
+    for name in ("servos", "rubbed", "ball", "rough"):
+        assert rows[name]["refused"] == ""
+        assert float(rows[name]["relative error of qacc"]) < 1e-9 and float(rows[name]["step"]) < 1e-9
+        assert float(rows[name]["states"]) == foreign.STEPS
+    assert rows["ball"]["absent meshes"] == "1" and rows["ball"]["with contact"] == "16"
+    assert rows["rough"]["outcome"] == "equal off the ground" and 0 < float(rows["rough"]["step of told contacts"]) < 1
+    assert "8 of each rim of a cylinder" in rows["rough"]["told"]
+
+
+def test_no_recorded_difference_is_silent() -> None:
+    rows = read_csv(ROOT / "results" / "cpu" / "foreign.csv")
+    assert rows and not [row["file"] for row in rows if row["outcome"] == "silent"]
+    assert not [row["file"] for row in rows if row["outcome"] == "told" and "Left out" not in row["told"]]
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        ({"step": ""}, "loaded"),
+        ({"step": 1e-9, "with contact": 3}, "equal on the ground"),
+        ({"step": 1e-3, "converged": 1e-9}, "equal if converged"),
+        ({"step": 1e-3, "converged": 1e-3, "told": "Left out: noslip"}, "told"),
+        ({"step": float("nan"), "converged": float("nan"), "told": ""}, "silent"),
+    ],
+)
+def test_a_difference_that_nothing_tells_is_silent(cells: dict[str, object], expected: str) -> None:
+    assert foreign.outcome({"refused": ""} | cells) == expected
 
 
 # Speed ----------------------------------------------------------------------------------------------------------------

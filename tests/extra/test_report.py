@@ -66,6 +66,14 @@ def test_command(tmp_path, capsys):
             standing('<joint type="free" frictionloss="1"/>'),
             "Left out: frictionloss of a free joint (use <freejoint/>). MuJoCo's",
         ),
+        (
+            robot(
+                '<body><freejoint/><geom size="0.1"/></body>'
+                '<body name="post"><joint/><geom size="1" contype="0" conaffinity="0"/></body>'
+            ),
+            "Left out, with their actuators: bodies that touch nothing, 'post'.",
+        ),
+        (pendulum(world='<body name="hand" mocap="true"/>'), "Mocap bodies stay where the file has them: 'hand'."),
         (standing(option='noslip_iterations="9"'), "Left out: noslip_iterations. MuJoCo's steps change by "),
         (standing(option='integrator="RK4"'), "Left out: integrator RK4, simulated as Euler. MuJoCo's"),
         (

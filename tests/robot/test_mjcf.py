@@ -15,6 +15,9 @@ from scenes import (
     tendon,
 )
 
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import SceneError
+
 
 def test_box_touches_with_its_corners():
     scene = parse(robot('<body pos="0 0 1"><freejoint/><geom type="box" size="1 2 3" pos="5 0 0"/></body>'))
@@ -51,6 +54,41 @@ def test_points_of_a_shape_are_as_deep_as_the_shape(geom, count, error, rng):
         lowest, middle = data.contact.dist.min(), data.geom_xpos[1, 2]
         ours = reference.contacts(scene, data.qpos, np.zeros(6))[0].min()
         assert -1e-6 < ours - lowest <= error * (middle - lowest) + 1e-6
+
+
+def test_bodies_beside_a_robot_that_touch_nothing_are_left_out():
+    """The robot moves as beside them in MuJoCo; a body that can touch something, or is tied to the robot, stays."""
+    ghost = '<geom size="0.1" contype="0" conaffinity="0"/>'
+    post = f'<body name="post" pos="0 0 9"><joint name="unused"/>{ghost}<body><joint/>{ghost}</body></body>'
+    leg = '<body pos="0.2 0 0"><joint name="hip" axis="0 1 0"/><geom size="0.05" pos="0.2 0 0"/></body>'
+    actuators = '<motor name="idle" joint="unused"/><motor name="drive" joint="hip" gear="3"/>'
+    rest = f'<actuator>{actuators}</actuator><sensor><jointpos joint="unused"/></sensor>'
+    rest += '<keyframe><key qpos="0 0 0.0999 1 0 0 0 0.1 5 6 1 2 3 1 0 0 0" ctrl="0.2 0.7"/></keyframe>'
+    ball = f'<body name="target"><freejoint/>{ghost}</body>'
+    text = robot(f'<body><freejoint/><geom size="0.1"/>{leg}</body>{post}{ball}', rest)
+    scene, full = parse(text), mujoco.MjModel.from_xml_string(text)
+    assert scene.left_out == ("post", "target") and (scene.nq, scene.nv, scene.nu) == (8, 7, 1)
+    np.testing.assert_array_equal(scene.mj_model.key_qpos[0], full.key_qpos[0, :8])
+    data, rest_of = mujoco.MjData(full), mujoco.MjData(scene.mj_model)
+    mujoco.mj_resetDataKeyframe(full, data, 0)
+    mujoco.mj_resetDataKeyframe(scene.mj_model, rest_of, 0)
+    mujoco.mj_step(full, data, 20)
+    mujoco.mj_step(scene.mj_model, rest_of, 20)
+    np.testing.assert_allclose(rest_of.qvel, data.qvel[:7], atol=1e-8)
+    assert load_scene(mujoco.MjSpec.from_string(text)).left_out == scene.left_out
+    solid = text.replace(ghost, '<geom size="0.1"/>')
+    tied = text.replace("</mujoco>", '<tendon><fixed><joint joint="unused" coef="1"/></fixed></tendon></mujoco>')
+    for bad in (solid, tied):
+        with pytest.raises(SceneError, match="'post'.*next to a floating robot no other body has joints"):
+            parse(bad)
+    with pytest.raises(SceneError, match="next to a floating robot no other body has joints"):
+        load_scene(full)  # of which nothing can be removed
+
+
+def test_a_mocap_body_that_touches_nothing_stays():
+    goal = '<body name="goal" mocap="true"><geom size="0.1" contype="0" conaffinity="0"/></body>'
+    scene = parse(pendulum(world=f'<geom type="plane" size="1 1 1"/>{goal}'))
+    assert scene.ncontact == 1 and scene.left_out == () and scene.nv == 1
 
 
 def test_spheres_inside_another_are_dropped():

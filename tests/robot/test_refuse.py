@@ -61,9 +61,6 @@ REFUSED = {  # what the variants of test_variants.py have not
     "joint 'j': actuatorgravcomp within actuatorfrcrange is not simulated": robot(
         f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BALL}</body>'
     ),
-    "joint 'loose': one free joint, of the first moving body, is simulated": robot(
-        f'<body><joint/>{BALL}</body><body><freejoint name="loose"/>{BALL}</body>'
-    ),
     "joint 'weak': actuatorfrcrange together with muscles is not simulated": tendon(
         joint='<joint name="weak" actuatorfrcrange="-1 1"/>', actuator=MUSCLES
     ),
@@ -72,12 +69,22 @@ REFUSED = {  # what the variants of test_variants.py have not
         robot(f'<body><joint name="a" type="slide"/><joint name="b" type="slide"/>{BALL}</body>'),
         slides("1e-8"),
     ],
+    # equality
+    "equality 'loop': connect is not simulated; remove it, or all of them by <flag equality=\"disable\"/>": pendulum(
+        rest='<equality><connect name="loop" body1="arm" anchor="0 0 0"/></equality>'
+    ),
+    "equality 'mimic': joint is not simulated": pendulum(
+        rest='<equality><joint name="mimic" joint1="hinge"/></equality>'
+    ),
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),
-    "body 'post': a second base besides a floating one; remove its joints and their actuators": robot(
-        f'<body><freejoint/>{BALL}</body><body name="post"><joint/>{BALL}</body>'
+    "body 'post': next to a floating robot no other body has joints, and next to any robot no other one is free; ": [
+        robot(f'<body>{base}{BALL}</body><body name="post">{joint}{BALL}</body>')  # which the robot can touch
+        for base, joint in (("<freejoint/>", "<joint/>"), ("<joint/>", "<freejoint/>"), ("<freejoint/>",) * 2)
+    ],
+    "body 'hand': contact of a mocap body is not simulated; set contype and conaffinity to 0 if only drawn": pendulum(
+        world=f'<body name="hand" mocap="true">{BALL}</body>'
     ),
-    "body 'hand': mocap is not simulated": pendulum(world=f'{FLOOR}<body name="hand" mocap="true"/>'),
     "body 'fin': in a fluid each body needs a joint; merge its geoms": pendulum(
         inside=f'<body name="fin">{BALL}</body>', rest='<option density="1"/>'
     ),
