@@ -1,0 +1,340 @@
+"""RPO, Reparameterization Proximal Policy Optimization (after Zhong et al. 2025, https://arxiv.org/abs/2508.06214).
+
+SHAC's gradient, used more than once. One rollout and one backward pass through the simulator give the gradient with
+respect to each action. The actor descends it for several epochs, bounded as in PPO, without the simulator.
+
+    python rpo.py --env ant --seed 1                                   train; writes runs/ant__rpo__1__<time>/
+    python rpo.py --resume runs/ant__rpo__1__<time>/checkpoint.pt      continue an interrupted run exactly
+    python rpo.py --evaluate runs/ant__rpo__1__<time>/checkpoint.pt    evaluate its deterministic policy
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from diffsim import DiffEnv
+from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
+from diffsim.training.flags import Flags
+from diffsim.training.layers import Chain, mlp
+from diffsim.training.ranges import Count, Finite, Fraction, NonNegative, Positive, UpTo10k, UpTo1000, Widths
+
+# SHAC's networks and rates, and what our trials of epochs, trust, environments and the critic's passes found.
+# fmt: off
+COLUMNS = ("actor_hidden", "critic_hidden", "actor_lr", "critic_lr", "target_alpha", "num_envs", "horizon",
+           "iterations", "critic_iterations", "epochs", "trust")
+PER_TASK = {
+    "cartpole":     ((64, 64),      (64, 64),   1e-2, 1e-3, 0.2,   64, 32,  300, 8, 4, 0.5),
+    "hopper":       ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2, 1024, 32,  400, 8, 8, 1.0),
+    "half_cheetah": ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2, 1024, 32,  600, 8, 4, 0.5),
+    "ant":          ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,  256, 32, 1200, 8, 2, 0.3),
+    "humanoid":     ((256, 128),    (128, 128), 2e-3, 5e-4, 0.9, 1024, 32,  800, 8, 4, 0.5),
+    "humanoid_mtu": ((512, 256),    (256, 256), 2e-3, 5e-4, 0.9, 1024, 32,  600, 8, 4, 0.5),
+    "go2":          ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9, 1024, 16,  300, 4, 4, 0.5),
+    "g1":           ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9, 1024, 16,  600, 4, 4, 0.5),
+    "g1_track":     ((256, 128),    (512, 256), 2e-3, 1e-3, 0.9, 1024, 16,  400, 8, 4, 0.5),
+}
+PER_TASK |= {"walker": PER_TASK["hopper"], "swimmer": PER_TASK["half_cheetah"], "go1": PER_TASK["go2"]}
+PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
+CPU = {"num_envs": 64, "critic_iterations": 4}  # at most, where environments cost time in proportion
+ON_CPU: dict[str, dict[str, Any]] = {"g1_track": {"critic_hidden": (256, 128), "iterations": 800}}
+MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}  # MuJoCo's contact, whose gradients agree over few steps
+# Robots with servos, on MuJoCo's contact, begin near their standing pose: little noise, actions near zero.
+STANDING = dict.fromkeys(("go1", "go2", "g1", "g1_track"), {"initial_log_std": -2.0, "adjoint_clip": 5.0})
+# fmt: on
+RATIO_TRUST = 0.2  # with --bound ratio, in place of the table's
+GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
+CRITIC_MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
+MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of both optimizers; Adam's decay rates of the gradient's moments
+FINAL_LR = 1e-5  # both learning rates reach it, linearly, after the last iteration
+ELU = partial(nn.ELU, inplace=True)
+
+
+@dataclass
+class Args(Flags):
+    """The algorithm. With --epochs 1 --minibatches 1 an iteration is SHAC's."""
+
+    num_envs: Count = 64
+    """parallel environments N, over all processes of torchrun (per task)"""
+    horizon: Count = 32
+    """control steps H of a rollout (per task)"""
+    actor_hidden: Widths = (256, 128)
+    """units of the actor's hidden layers (per task)"""
+    initial_log_std: Finite = -1.0
+    """initial log standard deviation of the noise, before tanh (per task)"""
+    actor_lr: Positive = 2e-3
+    """initial learning rate of the actor (per task)"""
+    epochs: UpTo1000 = 4
+    """passes of the actor over a rollout's samples and their gradients (per task)"""
+    minibatches: UpTo1000 = 4
+    """minibatches of such a pass, each a step of the actor"""
+    bound: Literal["distance", "ratio", "none"] = "distance"
+    """what ends the reuse of a sample: how far its action has moved, or how much its probability has changed"""
+    trust: Positive = 0.3
+    """the bound, in standard deviations of an action, or of the probabilities' ratio from 1 (per task and --bound)"""
+    kl_coef: NonNegative = 0.0
+    """weight of the KL divergence from the policy that acted, in the loss"""
+    critic_hidden: Widths = (128, 128)
+    """units of the critic's hidden layers (per task)"""
+    critic_lr: Positive = 5e-4
+    """initial learning rate of the critic (per task)"""
+    critic_iterations: UpTo10k = 8
+    """passes over the samples of a rollout to fit the critic (per task)"""
+    target_alpha: Fraction = 0.9
+    """target critic <- alpha target critic + (1 - alpha) critic, each iteration (per task)"""
+    symmetric: bool = False
+    """treat left and right alike: a mirrored state gets the mirrored action (per task; docs/sapo.md)"""
+    adjoint_clip: NonNegative = 0.0
+    """clip gradients with respect to a state to this many times the batch's median (per task; 0: do not clip)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        if self.device == "cpu":
+            values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
+            values |= ON_CPU.get(self.task, {})
+        if self.contact == "mujoco" and self.task not in STANDING:
+            values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
+        if self.bound == "ratio":
+            values["trust"] = RATIO_TRUST
+        return super().task_defaults() | values | STANDING.get(self.task, {})
+
+    def check(self) -> None:
+        super().check()
+        if max(self.minibatches, CRITIC_MINIBATCHES) > (samples := self.num_envs * self.horizon):
+            fail(f"--num-envs {self.num_envs} x --horizon {self.horizon} are {samples} samples: too few minibatches")
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+class Actor(nn.Module):
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state."""
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        super().__init__()
+        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        self.normalizer = ObsNormalizer(obs_dim)
+        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, ELU, norm=True, columns=env.task.actor_dim)
+        if args.task in STANDING:
+            with torch.no_grad():
+                self.mean[-1].get_parameter("weight").mul_(0.01)
+                self.mean[-1].get_parameter("bias").zero_()
+        self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
+
+    def forward(self, obs: Tensor, noise: Tensor) -> Tensor:
+        return torch.tanh(self.mean(self.normalizer(obs)) + noise)
+
+    def deterministic(self) -> nn.Sequential:
+        """Return the policy without noise, with the same weights."""
+        return Chain(self.normalizer, *self.mean, nn.Tanh())
+
+
+# The algorithm -------------------------------------------------------------------------------------------------------
+
+
+class Rollout(NamedTuple):
+    """What happened in one rollout, time first: (H, N, ...)."""
+
+    obs: Tensor  # s_t, on which the policy acted
+    next_obs: Tensor  # s_{t+1}, before any reset
+    reward: Tensor
+    terminated: Tensor
+    done: Tensor  # terminated or truncated
+
+
+class Batch(NamedTuple):
+    """What the actor's update needs of a rollout's samples, or of some of them: (B, ...)."""
+
+    obs: Tensor  # normalized
+    mean: Tensor  # of the policy that acted
+    eps: Tensor  # standard normal noise: it took u = mean + std eps, before tanh
+    gradient: Tensor  # dJ/du of the rollout's loss J
+
+
+class RPO:
+    """What an iteration changes, and the iteration."""
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        self.actor = Actor(args, env).to(env.device)
+        self.critic = mlp(env.task.obs_dim, args.critic_hidden, 1, ELU, norm=True, orthogonal=True).to(env.device)
+        if args.symmetric:
+            self.make_alike()
+        self.policy = self.actor.deterministic()
+        self.target = copy.deepcopy(self.critic).requires_grad_(False)
+        self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS)
+        self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
+        # The deviation's own numbers, also where log_std is computed from them (--symmetric).
+        (self.deviation,) = (p for name, p in self.actor.named_parameters() if "log_std" in name)
+
+    def make_alike(self) -> None:
+        """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
+        mirror = self.env.task.mirror
+        mirror_statistics(self.actor.normalizer, mirror.obs)
+        for network, output in ((self.actor.mean, mirror.action), (self.critic, mirror.value)):
+            mirror_inputs(network, mirror.obs)
+            mirror_outputs(network, output)
+        mirror_parameter(self.actor, "log_std", mirror.action)
+
+    def iterate(self) -> dict[str, Tensor]:
+        """Act for a rollout, take its gradient once, descend it several times, fit the critic; returns metrics.
+
+        It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
+        """
+        args, normalizer = self.args, self.actor.normalizer
+
+        # Act for H steps in N environments, where they stand. The noise is a leaf of torch's graph.
+        std = self.actor.log_std.detach().exp()
+        eps = torch.randn(args.horizon, self.env.num_envs, len(std), device=std.device)
+        noise = (std * eps).requires_grad_()
+        rollout = collect(self.env, self.actor, noise)
+
+        # SHAC's loss. Its gradient with respect to the noise is that with respect to the actions u = mean + noise.
+        next_value = self.target(normalizer(rollout.next_obs)).squeeze(-1).masked_fill(rollout.terminated, 0.0)
+        loss = actor_loss(rollout.reward, next_value, rollout.done, GAMMA)
+        if not loss.requires_grad:
+            fail("the loss has no gradient: observe and reward must be torch operations, without detach and no_grad")
+        (gradient,) = torch.autograd.grad(loss, noise)
+
+        # Several epochs on these numbers. Nothing of the simulator is needed any more.
+        obs = normalizer(rollout.obs.detach()).flatten(0, 1)
+        with torch.no_grad():
+            samples = Batch(obs, self.actor.mean(obs), eps.flatten(0, 1), gradient.flatten(0, 1))
+        metrics = self.fit_actor(samples, std)
+
+        # The critic is fitted to the TD(lambda) returns, and the target critic follows.
+        value = td_lambda(rollout.reward.detach(), next_value.detach(), rollout.done, GAMMA, LAMBDA)
+        critic_loss = self.fit_critic(obs, value.view(-1, 1))
+        normalizer.update(rollout.obs)
+        for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
+            slow.lerp_(fast.detach(), 1 - args.target_alpha)
+
+        return {
+            "losses/actor": loss.detach(),
+            "losses/critic": critic_loss,
+            **metrics,
+            "grad/skipped": self.actor_optimizer.skipped + self.critic_optimizer.skipped,
+            "charts/std": self.actor.log_std.detach().exp().mean(),
+            "charts/actor_lr": self.actor_optimizer.lr,
+            "charts/critic_lr": self.critic_optimizer.lr,
+        }
+
+    def fit_actor(self, samples: Batch, old_std: Tensor) -> dict[str, Tensor]:
+        """Descend the surrogate in epochs of minibatches; returns metrics, each the mean of all steps.
+
+        The deviation keeps its first step only, as in SHAC. Each further one would shrink the noise again along the
+        same samples, and with it the bound: learning would end early.
+        """
+        args, optimizer, metrics, once = self.args, self.actor_optimizer, list[Tensor](), list[Tensor]()
+        for _ in range(args.epochs):
+            for part in torch.randperm(len(samples.obs), device=samples.obs.device).tensor_split(args.minibatches):
+                b = Batch(*(tensor[part] for tensor in samples))
+                mean, std = self.actor.mean(b.obs), self.actor.log_std.exp()
+                change, beyond = surrogate(args.bound, args.trust, b, mean, std, old_std)
+                kl = kl_divergence(b.mean, old_std, mean, std)
+                gradient = optimizer.gradient(args.minibatches * change + args.kl_coef * kl)
+                metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
+                once = once or [self.deviation.detach().clone()]
+        self.deviation.detach().copy_(once[0])
+        names = "losses/approx_kl", "losses/clipfrac", "grad/norm"
+        return dict(zip(names, torch.stack(metrics).mean(0), strict=True))
+
+    def fit_critic(self, obs: Tensor, value: Tensor) -> Tensor:
+        """Fit V to values (B, 1) of normalized observations (B, obs_dim); returns the mean loss of the last pass."""
+        optimizer, losses = self.critic_optimizer, list[Tensor]()
+        batches = [*zip(obs.tensor_split(CRITIC_MINIBATCHES), value.tensor_split(CRITIC_MINIBATCHES), strict=True)]
+        for _ in range(self.args.critic_iterations):
+            losses = []
+            for some_obs, some_value in batches:
+                loss = F.mse_loss(self.critic(some_obs), some_value)
+                optimizer.step(optimizer.gradient(loss))
+                losses.append(loss.detach())
+        return torch.stack(losses).mean()
+
+
+def surrogate(bound: str, trust: float, b: Batch, mean: Tensor, std: Tensor, old_std: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum over samples what moving their actions changes in J, to first order; and the share beyond the bound.
+
+    distance: an action u follows the policy, mean + std eps, and gains nothing by more than `trust` deviations.
+    ratio: u stays, the policy passes through it with other noise, and its gradient counts pi(u|s) / pi_old(u|s) times,
+    or not at all where this ratio is off 1 by more than `trust`.
+    none: as distance, without the bound.
+    """
+    u = b.mean + old_std * b.eps
+    if bound == "ratio":
+        eps = ((u - mean) / std).detach()
+        ratio = ((b.eps.square() - eps.square()) / 2 + (old_std / std.detach()).log()).sum(-1, keepdim=True).exp()
+        beyond = (ratio - 1).abs() > trust
+        return (ratio.masked_fill(beyond, 0.0) * b.gradient * (mean + std * eps)).sum(), beyond.to(ratio.dtype).mean()
+    move, most = mean + std * b.eps - u, trust * old_std
+    change, beyond = b.gradient * move, move.detach().abs() > most
+    if bound == "distance":
+        change = torch.maximum(change, b.gradient * move.clamp(-most, most))
+    return change.sum(), beyond.to(move.dtype).mean()
+
+
+def kl_divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """KL(pi_old || pi) of diagonal Gaussians, mean over states."""
+    ratio = (old_std.square() + (old_mean - mean).square()) / std.square()
+    return ((std / old_std).log() + (ratio - 1) / 2).sum(-1).mean()
+
+
+def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
+    """Take H steps of all environments from where they stand, with the policy's noise (H, N, action_dim)."""
+    steps, obs = [], env.detach()  # no gradient goes back to the steps before
+    for step_noise in noise.unbind():
+        next_obs, reward, terminated, truncated, info = env.step(actor(obs, step_noise))
+        steps.append((obs, info["final_obs"], reward, terminated, terminated | truncated))
+        obs = next_obs
+    return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
+
+
+def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
+    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
+    ages, age = [], torch.zeros_like(reward[0])
+    for ended in done:
+        ages.append(age)
+        age = (age + 1).masked_fill(ended, 0.0)
+    discount = gamma ** torch.stack(ages)
+    ends = done.clone()
+    ends[-1] = True
+    return -(discount * reward + discount * gamma * ends * next_value).mean()
+
+
+def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
+    returns, following = torch.empty_like(reward), next_value[-1]
+    for t in reversed(range(len(reward))):
+        following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))
+        following = returns[t] = reward[t] + gamma * following
+    return returns
+
+
+# The run --------------------------------------------------------------------------------------------------------------
+
+
+def train(args: Args) -> None:
+    run = Run(args)
+    env = run.make_env(args.num_envs, args.horizon, adjoint_clip=args.adjoint_clip)
+    rpo = run.restore(RPO(args, env))
+    iterate = run.capture(rpo.iterate, env)
+    for iteration in run:
+        done = (iteration - 1) / args.iterations
+        rpo.actor_optimizer.lr.fill_(args.actor_lr + (FINAL_LR - args.actor_lr) * done)
+        rpo.critic_optimizer.lr.fill_(args.critic_lr + (FINAL_LR - args.critic_lr) * done)
+        run.log(iterate())
+        if run.evaluation_due:
+            run.evaluate(rpo.policy)
+
+
+main = script(Args, train)
+
+if __name__ == "__main__":
+    main()
