@@ -74,7 +74,7 @@ class Args(Flags):
     epochs: UpTo1000 = 4
     """passes of the actor over a rollout's samples and their gradients (per task)"""
     minibatches: UpTo1000 = 4
-    """minibatches of such a pass, each a step of the actor"""
+    """minibatches of such a pass, each a step of the actor on its share of the environments"""
     bound: Literal["distance", "ratio", "none"] = "distance"
     """what ends the reuse of a sample: how far its action has moved, or how much its probability has changed"""
     trust: Positive = 0.3
@@ -107,8 +107,8 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        if max(self.minibatches, CRITIC_MINIBATCHES) > (samples := self.num_envs * self.horizon):
-            fail(f"--num-envs {self.num_envs} x --horizon {self.horizon} are {samples} samples: too few minibatches")
+        if CRITIC_MINIBATCHES > self.num_envs * self.horizon:
+            fail(f"--num-envs {self.num_envs} with --horizon {self.horizon} are too few samples for the critic")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ class Rollout(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What the actor's update needs of a rollout's samples, or of some of them: (B, ...)."""
+    """What the actor's update needs of a rollout, or of some of its environments: (H, B, ...)."""
 
     obs: Tensor  # normalized
     mean: Tensor  # of the policy that acted
@@ -171,8 +171,7 @@ class RPO:
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS)
         self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
-        # The deviation's own numbers, also where log_std is computed from them (--symmetric).
-        (self.deviation,) = (p for name, p in self.actor.named_parameters() if "log_std" in name)
+        self.deviation = next(p for name, p in self.actor.named_parameters() if "log_std" in name)  # also with a mirror
 
     def make_alike(self) -> None:
         """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
@@ -204,14 +203,14 @@ class RPO:
         (gradient,) = torch.autograd.grad(loss, noise)
 
         # Several epochs on these numbers. Nothing of the simulator is needed any more.
-        obs = normalizer(rollout.obs.detach()).flatten(0, 1)
+        obs = normalizer(rollout.obs.detach())
         with torch.no_grad():
-            samples = Batch(obs, self.actor.mean(obs), eps.flatten(0, 1), gradient.flatten(0, 1))
+            samples = Batch(obs, self.actor.mean(obs), eps, gradient)
         metrics = self.fit_actor(samples, std)
 
         # The critic is fitted to the TD(lambda) returns, and the target critic follows.
         value = td_lambda(rollout.reward.detach(), next_value.detach(), rollout.done, GAMMA, LAMBDA)
-        critic_loss = self.fit_critic(obs, value.view(-1, 1))
+        critic_loss = self.fit_critic(obs.flatten(0, 1), value.view(-1, 1))
         normalizer.update(rollout.obs)
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
@@ -232,14 +231,15 @@ class RPO:
         The deviation keeps its first step only, as in SHAC. Each further one would shrink the noise again along the
         same samples, and with it the bound: learning would end early.
         """
+        parts = min(self.args.minibatches, self.env.num_envs)
         args, optimizer, metrics, once = self.args, self.actor_optimizer, list[Tensor](), list[Tensor]()
         for _ in range(args.epochs):
-            for part in torch.randperm(len(samples.obs), device=samples.obs.device).tensor_split(args.minibatches):
-                b = Batch(*(tensor[part] for tensor in samples))
+            for part in torch.randperm(self.env.num_envs, device=old_std.device).tensor_split(parts):
+                b = Batch(*(tensor[:, part] for tensor in samples))
                 mean, std = self.actor.mean(b.obs), self.actor.log_std.exp()
                 change, beyond = surrogate(args.bound, args.trust, b, mean, std, old_std)
                 kl = kl_divergence(b.mean, old_std, mean, std)
-                gradient = optimizer.gradient(args.minibatches * change + args.kl_coef * kl)
+                gradient = optimizer.gradient(parts * change + args.kl_coef * kl)
                 metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
                 once = once or [self.deviation.detach().clone()]
         self.deviation.detach().copy_(once[0])
