@@ -1,9 +1,7 @@
 """RPO, Reparameterization Proximal Policy Optimization (after Zhong et al. 2025, https://arxiv.org/abs/2508.06214).
 
-A rollout and its backward pass through the simulator are dear, a step of the policy is cheap. So one backward pass
-keeps g = dJ/du, the gradient of SHAC's loss J in each action u of the rollout, before tanh. The policy then takes many
-Adam steps along the same g, without the simulator, and a bound keeps each action near the rollout's. With one epoch and
-one minibatch an iteration is SHAC's. docs/rpo.md says what is the paper's.
+SHAC's gradient, used more than once. One rollout and one backward pass through the simulator give the gradient with
+respect to each action. The actor descends it for several epochs, bounded as in PPO, without the simulator.
 
     python rpo.py --env ant --seed 1                                   train; writes runs/ant__rpo__1__<time>/
     python rpo.py --resume runs/ant__rpo__1__<time>/checkpoint.pt      continue an interrupted run exactly
@@ -26,80 +24,69 @@ from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_paramet
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, mlp
-from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, UpTo10k, Widths
+from diffsim.training.ranges import Count, Finite, Fraction, NonNegative, Positive, UpTo10k, UpTo1000, Widths
 
-# Networks are SHAC's; the rest was chosen by trials (docs/rpo.md).
+# SHAC's networks and rates, and what our trials of epochs, trust, environments and the critic's passes found.
 # fmt: off
-COLUMNS = ("actor_hidden", "critic_hidden", "critic_lr", "target_alpha", "num_envs", "epochs", "trust",
-           "critic_iterations", "iterations")
+COLUMNS = ("actor_hidden", "critic_hidden", "actor_lr", "critic_lr", "target_alpha", "num_envs", "horizon",
+           "iterations", "critic_iterations", "epochs", "trust")
 PER_TASK = {
-    "cartpole":     ((64, 64),      (64, 64),   1e-3, 0.2,    64, 4, 0.5,  8,  300),
-    "hopper":       ((128, 64, 32), (64, 64),   2e-3, 0.2,   256, 8, 1.0,  4,  400),
-    "half_cheetah": ((128, 64, 32), (64, 64),   2e-3, 0.2,    64, 4, 0.5,  8,  600),
-    "ant":          ((128, 64, 32), (64, 64),   2e-3, 0.2,    64, 2, 0.3,  4, 1200),
-    "humanoid":     ((256, 128),    (128, 128), 5e-4, 0.9,    64, 4, 0.5,  4,  800),
-    "humanoid_mtu": ((512, 256),    (256, 256), 5e-4, 0.9,    64, 4, 0.5,  4,  800),
-    "humanoid_imitation": ((256, 128), (128, 128), 5e-4, 0.9, 64, 4, 0.5,  4,  800),
-    "go1":          ((256, 128),    (256, 128), 1e-3, 0.9,    64, 4, 0.5,  4,  400),
-    "go2":          ((256, 128),    (256, 128), 1e-3, 0.9,    64, 4, 0.5,  4,  400),
-    "g1":           ((256, 128),    (256, 128), 1e-3, 0.9,    64, 4, 0.5,  4,  600),
-    "g1_track":     ((256, 128),    (512, 256), 1e-3, 0.9,   256, 4, 0.5,  8,  400),
+    "cartpole":     ((64, 64),      (64, 64),   1e-2, 1e-3, 0.2,   64, 32,  300, 8, 4, 0.5),
+    "hopper":       ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2, 1024, 32,  400, 8, 8, 1.0),
+    "half_cheetah": ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2, 1024, 32,  600, 8, 4, 0.5),
+    "ant":          ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,  256, 32, 1200, 8, 2, 0.3),
+    "humanoid":     ((256, 128),    (128, 128), 2e-3, 5e-4, 0.9, 1024, 32,  800, 8, 4, 0.5),
+    "humanoid_mtu": ((512, 256),    (256, 256), 2e-3, 5e-4, 0.9, 1024, 32,  600, 8, 4, 0.5),
+    "go2":          ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9, 1024, 16,  300, 4, 4, 0.5),
+    "g1":           ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9, 1024, 16,  600, 4, 4, 0.5),
+    "g1_track":     ((256, 128),    (512, 256), 2e-3, 1e-3, 0.9, 1024, 16,  400, 8, 4, 0.5),
 }
-ON_GPU = {  # where environments cost little
-    "hopper": {"num_envs": 1024, "critic_iterations": 8},
-    "half_cheetah": {"num_envs": 256},
-    "humanoid": {"num_envs": 1024, "critic_iterations": 8},
-    "humanoid_mtu": {"num_envs": 1024, "critic_iterations": 8, "iterations": 400},
-    "humanoid_imitation": {"num_envs": 1024, "critic_iterations": 8},
-} | {name: {"num_envs": 1024} for name in ("go1", "go2", "g1", "g1_track")}
-# Robots with servos begin near their standing pose: little noise, actions near zero.
-STANDING = {"horizon": 16, "initial_log_std": -2.0, "adjoint_clip": 5.0}
-BEGINNING = dict.fromkeys(("go1", "go2", "g1", "g1_track"), STANDING)
-GAIN = dict.fromkeys(BEGINNING, 0.01)  # factor of the weights of the actor's last layer at first, otherwise 1
-# Cheaper than SHAC's, as SAPO's; policies keep their return at four times the substeps (docs/numerics.md).
-INTEGRATION = {"ant": {"substeps": 8, "implicit": True}}
-INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), {"substeps": 16, "implicit": True})
+PER_TASK |= {"walker": PER_TASK["hopper"], "swimmer": PER_TASK["half_cheetah"], "go1": PER_TASK["go2"]}
+PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
+CPU = {"num_envs": 64, "critic_iterations": 4}  # at most, where environments cost time in proportion
+ON_CPU: dict[str, dict[str, Any]] = {"g1_track": {"critic_hidden": (256, 128), "iterations": 800}}
+MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}  # MuJoCo's contact, whose gradients agree over few steps
+# Robots with servos, on MuJoCo's contact, begin near their standing pose: little noise, actions near zero.
+STANDING = dict.fromkeys(("go1", "go2", "g1", "g1_track"), {"initial_log_std": -2.0, "adjoint_clip": 5.0})
 # fmt: on
+RATIO_TRUST = 0.2  # with --bound ratio, in place of the table's
+GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
+CRITIC_MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
 MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of both optimizers; Adam's decay rates of the gradient's moments
 FINAL_LR = 1e-5  # both learning rates reach it, linearly, after the last iteration
-CRITIC_MINIBATCHES = 4  # of a pass, contiguous in time
 ELU = partial(nn.ELU, inplace=True)
 
 
 @dataclass
 class Args(Flags):
-    """The algorithm. Defaults are those of a task that is not in the table."""
+    """The algorithm. With --epochs 1 --minibatches 1 an iteration is SHAC's."""
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""
     horizon: Count = 32
-    """control steps h of a rollout (per task)"""
-    gamma: Fraction = 0.99
-    """discount factor"""
-    epochs: Count = 4
-    """passes of the actor over a rollout's samples (per task)"""
-    minibatches: UpTo10k = 4
-    """parts of a pass, each with its own environments"""
-    bound: Literal["distance", "ratio"] = "distance"
-    """what a sample's step is bounded by: how far its action moves, or PPO's ratio of densities (the paper's)"""
-    trust: Positive = 0.5
-    """the bound: standard deviations of the rollout's noise, or by how much the ratio may differ from 1 (per task)"""
-    kl_coef: NonNegative = 0.0
-    """weight of the divergence from the rollout's policy (the paper's second term)"""
+    """control steps H of a rollout (per task)"""
     actor_hidden: Widths = (256, 128)
     """units of the actor's hidden layers (per task)"""
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the noise, before tanh (per task)"""
     actor_lr: Positive = 2e-3
-    """initial learning rate of the actor"""
-    td_lambda: Fraction = 0.95
-    """lambda of the value estimation"""
-    critic_hidden: Widths = (256, 128)
+    """initial learning rate of the actor (per task)"""
+    epochs: UpTo1000 = 4
+    """passes of the actor over a rollout's samples and their gradients (per task)"""
+    minibatches: UpTo1000 = 4
+    """minibatches of such a pass, each a step of the actor on its share of the environments"""
+    bound: Literal["distance", "ratio", "none"] = "distance"
+    """what ends the reuse of a sample: how far its action has moved, or how much its probability has changed"""
+    trust: Positive = 0.3
+    """the bound, in standard deviations of an action, or of the probabilities' ratio from 1 (per task and --bound)"""
+    kl_coef: NonNegative = 0.0
+    """weight of the KL divergence from the policy that acted, in the loss"""
+    critic_hidden: Widths = (128, 128)
     """units of the critic's hidden layers (per task)"""
-    critic_lr: Positive = 1e-3
+    critic_lr: Positive = 5e-4
     """initial learning rate of the critic (per task)"""
-    critic_iterations: Natural = 4
-    """passes over the samples of a rollout to fit the critic; 0: no value function (per task)"""
+    critic_iterations: UpTo10k = 8
+    """passes over the samples of a rollout to fit the critic (per task)"""
     target_alpha: Fraction = 0.9
     """target critic <- alpha target critic + (1 - alpha) critic, each iteration (per task)"""
     symmetric: bool = False
@@ -108,22 +95,20 @@ class Args(Flags):
     """clip gradients with respect to a state to this many times the batch's median (per task; 0: do not clip)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.task], strict=True)) if self.task in PER_TASK else {}
-        if self.device != "cpu":
-            values |= ON_GPU.get(self.task, {})
-        values |= BEGINNING.get(self.task, {})
-        if (
-            self.contact == "mujoco" and self.task not in BEGINNING
-        ):  # whose gradients agree over few steps: docs/transfer.md
-            values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs), "trust": 0.2}
-        if (self.accuracy, self.contact) == ("default", "soft"):
-            values |= INTEGRATION.get(self.task, {})
-        return super().task_defaults() | values
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        if self.device == "cpu":
+            values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
+            values |= ON_CPU.get(self.task, {})
+        if self.contact == "mujoco" and self.task not in STANDING:
+            values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
+        if self.bound == "ratio":
+            values["trust"] = RATIO_TRUST
+        return super().task_defaults() | values | STANDING.get(self.task, {})
 
     def check(self) -> None:
         super().check()
-        if self.minibatches > self.num_envs:
-            fail(f"--minibatches {self.minibatches} are more than the {self.num_envs} environments that they share")
+        if CRITIC_MINIBATCHES > self.num_envs * self.horizon:
+            fail(f"--num-envs {self.num_envs} with --horizon {self.horizon} are too few samples for the critic")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -137,9 +122,9 @@ class Actor(nn.Module):
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.normalizer = ObsNormalizer(obs_dim)
         self.mean = mlp(obs_dim, args.actor_hidden, action_dim, ELU, norm=True, columns=env.task.actor_dim)
-        if args.task in GAIN:
+        if args.task in STANDING:
             with torch.no_grad():
-                self.mean[-1].get_parameter("weight").mul_(GAIN[args.task])
+                self.mean[-1].get_parameter("weight").mul_(0.01)
                 self.mean[-1].get_parameter("bias").zero_()
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
 
@@ -151,7 +136,7 @@ class Actor(nn.Module):
         return Chain(self.normalizer, *self.mean, nn.Tanh())
 
 
-# The algorithm --------------------------------------------------------------------------------------------------------
+# The algorithm -------------------------------------------------------------------------------------------------------
 
 
 class Rollout(NamedTuple):
@@ -164,13 +149,13 @@ class Rollout(NamedTuple):
     done: Tensor  # terminated or truncated
 
 
-class Samples(NamedTuple):
-    """What the actor learns from, (H, N, ...)."""
+class Batch(NamedTuple):
+    """What the actor's update needs of a rollout, or of some of its environments: (H, B, ...)."""
 
     obs: Tensor  # normalized
-    eps: Tensor  # the noise in units of its deviation
-    mean: Tensor  # of the rollout's policy
-    slope: Tensor  # dJ/du
+    mean: Tensor  # of the policy that acted
+    eps: Tensor  # standard normal noise: it took u = mean + std eps, before tanh
+    gradient: Tensor  # dJ/du of the rollout's loss J
 
 
 class RPO:
@@ -186,6 +171,7 @@ class RPO:
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS)
         self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
+        self.deviation = next(p for name, p in self.actor.named_parameters() if "log_std" in name)  # also with a mirror
 
     def make_alike(self) -> None:
         """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
@@ -197,99 +183,107 @@ class RPO:
         mirror_parameter(self.actor, "log_std", mirror.action)
 
     def iterate(self) -> dict[str, Tensor]:
-        """Take one rollout, one backward pass and many steps of the policy; returns metrics.
+        """Act for a rollout, take its gradient once, descend it several times, fit the critic; returns metrics.
 
         It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
         """
-        args, actor = self.args, self.actor
+        args, normalizer = self.args, self.actor.normalizer
 
-        # Act for h steps in N environments, where they stand. torch records the steps, the simulator's included.
-        std = actor.log_std.detach().exp()
-        eps = torch.randn(args.horizon, self.env.num_envs, std.numel(), device=std.device)
+        # Act for H steps in N environments, where they stand. The noise is a leaf of torch's graph.
+        std = self.actor.log_std.detach().exp()
+        eps = torch.randn(args.horizon, self.env.num_envs, len(std), device=std.device)
         noise = (std * eps).requires_grad_()
-        rollout = collect(self.env, actor, noise)
+        rollout = collect(self.env, self.actor, noise)
 
-        # SHAC's loss (its Eq. 5), and its gradient in the noise: that in each action before tanh, dJ/du.
-        next_value = self.next_values(rollout)
-        loss = actor_loss(rollout.reward, next_value, rollout.done, args.gamma)
-        (slope,) = torch.autograd.grad(loss, noise)
+        # SHAC's loss. Its gradient with respect to the noise is that with respect to the actions u = mean + noise.
+        next_value = self.target(normalizer(rollout.next_obs)).squeeze(-1).masked_fill(rollout.terminated, 0.0)
+        loss = actor_loss(rollout.reward, next_value, rollout.done, GAMMA)
+        if not loss.requires_grad:
+            fail("the loss has no gradient: observe and reward must be torch operations, without detach and no_grad")
+        (gradient,) = torch.autograd.grad(loss, noise)
 
-        # Many steps along it, without the simulator. No gradient goes back from here.
-        obs, reward = actor.normalizer(rollout.obs.detach()), rollout.reward.detach()
-        norm = self.improve(Samples(obs, eps, actor.mean(obs).detach(), slope), std)
+        # Several epochs on these numbers. Nothing of the simulator is needed any more.
+        obs = normalizer(rollout.obs.detach())
+        with torch.no_grad():
+            samples = Batch(obs, self.actor.mean(obs), eps, gradient)
+        metrics = self.fit_actor(samples, std)
 
-        # SHAC's Eq. 7: the TD(lambda) returns, and Eq. 6: the critic fitted to them.
-        value = td_lambda(reward, next_value.detach(), rollout.done, args.gamma, args.td_lambda)
+        # The critic is fitted to the TD(lambda) returns, and the target critic follows.
+        value = td_lambda(rollout.reward.detach(), next_value.detach(), rollout.done, GAMMA, LAMBDA)
         critic_loss = self.fit_critic(obs.flatten(0, 1), value.view(-1, 1))
-        actor.normalizer.update(rollout.obs.detach())
+        normalizer.update(rollout.obs)
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
 
         return {
             "losses/actor": loss.detach(),
             "losses/critic": critic_loss,
-            "grad/norm": norm,
+            **metrics,
             "grad/skipped": self.actor_optimizer.skipped + self.critic_optimizer.skipped,
+            "charts/std": self.actor.log_std.detach().exp().mean(),
             "charts/actor_lr": self.actor_optimizer.lr,
-            "charts/std": std.mean(),
+            "charts/critic_lr": self.critic_optimizer.lr,
         }
 
-    def improve(self, samples: Samples, std: Tensor) -> Tensor:
-        """Take the actor's steps over samples whose noise had the deviation std; returns the first gradient's norm.
+    def fit_actor(self, samples: Batch, old_std: Tensor) -> dict[str, Tensor]:
+        """Descend the surrogate in epochs of minibatches; returns metrics, each the mean of all steps.
 
-        The deviation moves with the first step only: each further one would shrink it again for the same noise, until
-        the policy explores no more.
+        The deviation keeps its first step only, as in SHAC. Each further one would shrink the noise again along the
+        same samples, and with it the bound: learning would end early.
         """
-        args, norms, deviations = self.args, list[Tensor](), list[Tensor]()
-        parts = [Samples(*part) for part in zip(*(x.tensor_split(args.minibatches, 1) for x in samples), strict=True)]
-        for part in parts * args.epochs:
-            loss = args.minibatches * self.surrogate(part, std)
-            norms.append(self.actor_optimizer.step(self.actor_optimizer.gradient(loss)))
-            deviations.append(self.actor.log_std.detach().clone())
-        self.actor.log_std.detach().copy_(deviations[0])
-        return norms[0]
-
-    def surrogate(self, samples: Samples, std: Tensor) -> Tensor:
-        """Return what the loss becomes, to first order, where the policy moves the samples' actions.
-
-        Its gradient at the rollout's policy is that of SHAC's loss. What moved beyond the bound, downhill, has none.
-        """
-        args, mean, log_std = self.args, self.actor.mean(samples.obs), self.actor.log_std
-        slope, before = samples.slope, samples.mean + std * samples.eps
-        if args.bound == "distance":
-            moved = mean + log_std.exp() * samples.eps - before
-            reach = args.trust * std
-            loss = torch.maximum(slope * moved, slope * moved.clamp(-reach, reach)).sum()
-        else:  # the action stays, and the noise that would give it changes
-            eps = ((before - mean) / log_std.exp()).detach()
-            density, old = (-0.5 * e.square() - s for e, s in ((eps, log_std.detach()), (samples.eps, std.log())))
-            ratio = (density - old).sum(-1, keepdim=True).exp()
-            weight = ratio.where((ratio - 1).abs() < args.trust, 0.0)
-            loss = (weight * slope * (mean + log_std.exp() * eps)).sum()
-        if not args.kl_coef:
-            return loss
-        spread = log_std - std.log()
-        kl = spread + 0.5 * ((std.square() + (samples.mean - mean).square()) / (2 * log_std).exp() - 1)
-        return loss + args.kl_coef * kl.sum(-1).mean()
-
-    def next_values(self, rollout: Rollout) -> Tensor:
-        """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
-        if self.args.critic_iterations == 0:
-            return torch.zeros_like(rollout.reward)
-        values = self.target(self.actor.normalizer(rollout.next_obs)).squeeze(-1)
-        return values.masked_fill(rollout.terminated, 0.0)
+        parts = min(self.args.minibatches, self.env.num_envs)
+        args, optimizer, metrics, once = self.args, self.actor_optimizer, list[Tensor](), list[Tensor]()
+        for _ in range(args.epochs):
+            for part in torch.randperm(self.env.num_envs, device=old_std.device).tensor_split(parts):
+                b = Batch(*(tensor[:, part] for tensor in samples))
+                mean, std = self.actor.mean(b.obs), self.actor.log_std.exp()
+                change, beyond = surrogate(args.bound, args.trust, b, mean, std, old_std)
+                kl = kl_divergence(b.mean, old_std, mean, std)
+                gradient = optimizer.gradient(parts * change + args.kl_coef * kl)
+                metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
+                once = once or [self.deviation.detach().clone()]
+        self.deviation.detach().copy_(once[0])
+        names = "losses/approx_kl", "losses/clipfrac", "grad/norm"
+        return dict(zip(names, torch.stack(metrics).mean(0), strict=True))
 
     def fit_critic(self, obs: Tensor, value: Tensor) -> Tensor:
         """Fit V to values (B, 1) of normalized observations (B, obs_dim); returns the mean loss of the last pass."""
-        optimizer, parts = self.critic_optimizer, CRITIC_MINIBATCHES
-        losses = [torch.zeros_like(optimizer.skipped)]
+        optimizer, losses = self.critic_optimizer, list[Tensor]()
+        batches = [*zip(obs.tensor_split(CRITIC_MINIBATCHES), value.tensor_split(CRITIC_MINIBATCHES), strict=True)]
         for _ in range(self.args.critic_iterations):
             losses = []
-            for some_obs, some_value in zip(obs.tensor_split(parts), value.tensor_split(parts), strict=True):
+            for some_obs, some_value in batches:
                 loss = F.mse_loss(self.critic(some_obs), some_value)
                 optimizer.step(optimizer.gradient(loss))
                 losses.append(loss.detach())
         return torch.stack(losses).mean()
+
+
+def surrogate(bound: str, trust: float, b: Batch, mean: Tensor, std: Tensor, old_std: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum over samples what moving their actions changes in J, to first order; and the share beyond the bound.
+
+    distance: an action u follows the policy, mean + std eps, and gains nothing by more than `trust` deviations.
+    ratio: u stays, the policy passes through it with other noise, and its gradient counts pi(u|s) / pi_old(u|s) times,
+    or not at all where this ratio is off 1 by more than `trust`.
+    none: as distance, without the bound.
+    """
+    u = b.mean + old_std * b.eps
+    if bound == "ratio":
+        eps = ((u - mean) / std).detach()
+        ratio = ((b.eps.square() - eps.square()) / 2 + (old_std / std.detach()).log()).sum(-1, keepdim=True).exp()
+        beyond = (ratio - 1).abs() > trust
+        return (ratio.masked_fill(beyond, 0.0) * b.gradient * (mean + std * eps)).sum(), beyond.to(ratio.dtype).mean()
+    move, most = mean + std * b.eps - u, trust * old_std
+    change, beyond = b.gradient * move, move.detach().abs() > most
+    if bound == "distance":
+        change = torch.maximum(change, b.gradient * move.clamp(-most, most))
+    return change.sum(), beyond.to(move.dtype).mean()
+
+
+def kl_divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """KL(pi_old || pi) of diagonal Gaussians, mean over states."""
+    ratio = (old_std.square() + (old_mean - mean).square()) / std.square()
+    return ((std / old_std).log() + (ratio - 1) / 2).sum(-1).mean()
 
 
 def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
@@ -303,7 +297,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 5 of (H, N) steps: each environment's rollout is cut at its dones, and the discount restarts after them."""
+    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)
@@ -315,7 +309,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the rollout's end does."""
+    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))

@@ -27,6 +27,7 @@ _SMALL = (
 ).split()
 SMALL = {
     "shac": [*_SMALL, "--critic-iterations", "3"],
+    "rpo": [*_SMALL, "--critic-iterations", "3", "--epochs", "2", "--minibatches", "3"],
     "sapo": [*_SMALL, "--critic-iterations", "3", "--population", "3"],
     "bptt": _SMALL,
     "ppo_baseline": [*_SMALL, "--minibatch-size", "40", "--epochs", "2"],

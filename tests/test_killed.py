@@ -25,6 +25,7 @@ WINDOWS = "--env cartpole:motor=0.7:1.3,mass=0.5:2 --num-envs 6 --horizon 16"
 REPLAY = "--num-envs 5 --steps 8 --buffer-size 2000 --batch-size 32 --hidden 16 16"
 FLAGS = {
     "shac": f"{WINDOWS} --critic-iterations 2",
+    "rpo": f"{WINDOWS} --critic-iterations 2 --epochs 2",
     "sapo": f"{WINDOWS} --critic-iterations 2 --population 3",
     "bptt": WINDOWS,
     "ppo_baseline": f"{WINDOWS} --minibatch-size 40 --epochs 2",

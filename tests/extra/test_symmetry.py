@@ -12,6 +12,7 @@ from learners import assert_resumes, refusal, run
 from torch import Tensor, nn
 
 import diffsim
+import rpo
 import sapo
 import shac
 from diffsim.extra.mirror import Reflection
@@ -24,6 +25,7 @@ from diffsim.training.layers import First
 MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1")
 LEARNERS = {
     "shac": ("SHAC", "--actor-hidden 16 --critic-hidden 16"),
+    "rpo": ("RPO", "--actor-hidden 16 --critic-hidden 16"),
     "sapo": ("SAPO", "--actor-hidden 16 --critic-hidden 16 --population 2"),
     "ppo_baseline": ("PPO", "--hidden 16"),
 }
@@ -67,7 +69,7 @@ def test_in_the_mirror_a_policy_acts_as_its_image(script: str, task: str, tmp_pa
 
 def values(learner: Any, obs: Tensor) -> Tensor:
     """Of observations, by each value function and member, in the last two columns."""
-    if isinstance(learner, shac.SHAC):
+    if isinstance(learner, shac.SHAC | rpo.RPO):
         return learner.critic(learner.actor.normalizer(obs)).unsqueeze(-1)
     if isinstance(learner, sapo.SAPO):
         return learner.values(learner.critics, learner.actor.normalizer(obs).repeat(2, 1, 1)).movedim(-1, 0)
@@ -95,7 +97,7 @@ def test_the_noise_of_the_image_is_as_large(flags: str) -> None:
     assert_alike(image, mirror.action(action))
     torch.testing.assert_close(same, surprise, rtol=1e-5, atol=1e-4)
     if flags == "--no-state-std":
-        others = build("shac", "ant").actor, build("ppo_baseline", "ant").actor_critic
+        others = build("shac", "ant").actor, build("rpo", "ant").actor, build("ppo_baseline", "ant").actor_critic
         for log_std in (actor.log_std, *(other.log_std for other in others)):
             assert torch.equal(log_std, log_std.index_select(-1, mirror.action.index)) and log_std.std()
 
@@ -104,7 +106,7 @@ def test_the_noise_of_the_image_is_as_large(flags: str) -> None:
 def test_all_weights_have_gradients(script: str) -> None:
     learner = build(script, "ant")
     obs, policy = torch.randn(20, 37), learner.policy  # SAPO's is a copy
-    functions = policy, getattr(learner, {"shac": "critic", "sapo": "critics", "ppo_baseline": "actor_critic"}[script])
+    functions = policy, getattr(learner, {"sapo": "critics", "ppo_baseline": "actor_critic"}.get(script, "critic"))
     for function, result in zip(functions, (policy(obs), values(learner, obs)), strict=True):
         weights = [p for name, p in function.named_parameters() if "mean" not in name and "log_std" not in name]
         assert all(g.abs().sum() > 0 for g in torch.autograd.grad(result.square().sum(), weights))

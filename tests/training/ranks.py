@@ -15,6 +15,7 @@ from torch import Tensor
 
 import bptt
 import ppo_baseline
+import rpo
 import sapo
 import shac
 from diffsim.env import DiffEnv
@@ -50,7 +51,7 @@ def restore(run: Run, learner: Learner, restore: Callable[[Run, Learner], Learne
 def main(directory: str, *setting: str) -> None:
     Run.restore = restore
     finalize, distributed.finalize = distributed.finalize, lambda: None  # the ranks stay connected until the last one
-    for script in (bptt, ppo_baseline, sapo, shac):
+    for script in (bptt, ppo_baseline, rpo, sapo, shac):
         if script is shac:
             shac.Actor.sample_noise, DiffEnv._uniform, distributed.finalize = sample_noise, uniform, finalize
         rank, path = distributed.rank(), Path(directory) / script.__name__

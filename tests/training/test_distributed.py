@@ -54,7 +54,7 @@ def test_two_ranks_of_half_the_environments_are_one_of_all(directory, tmp_path, 
     assert count == 4 and length == 4 * 240
 
 
-@pytest.mark.parametrize("name", ["bptt", "ppo_baseline", "sapo", "shac"])
+@pytest.mark.parametrize("name", ["bptt", "ppo_baseline", "rpo", "sapo", "shac"])
 def test_ranks_share_weights_and_statistics_and_have_states_of_their_own(directory, name):
     first, second = (load(directory / f"{name}.{rank}.pt") for rank in range(2))
     checkpoint = load(directory / name / "checkpoint.pt")
