@@ -8,6 +8,7 @@ A policy acts with noise from states that it visits. The reward of a window is d
 of all of the window's actions: how well its mean over the environments agrees with differences of the mean reward,
 which see jumps that no derivative sees. All begin in one state, with its commands, clocks and random numbers. How far
 differences agree among themselves bounds that: by two sizes of the shift, and between two halves of the environments.
+The standard error of what they differ by, relative to the differences, tells how much other environments would change.
 In float64, tiny differences of single environments, which meet no jump, tell whether the derivative itself is right.
 The contacts are the paper's springs, without the robots that have dry friction, and MuJoCo's own. Writes gradients.csv.
 """
@@ -38,7 +39,8 @@ GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
 WINDOWS = 4, 8, 16  # control steps
 TINY, FEW = 1e-6, 32  # the shift in float64, and of how many environments at most
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
-AGREE = 0.9  # least cosine of differences by SHIFT and by half of it, for which the page shows others
+AGREE, CHANCE = 0.9, 0.5  # the page shows cosines where differences by SHIFT and by half of it agree better than by
+# the first, and where the standard error is below the second
 KEY = ("task", "learner", "horizon", "ground")
 Policy = Callable[[Tensor], Tensor | float]
 
@@ -118,7 +120,8 @@ def agreement(each: Tensor, slopes: Tensor, finer: Tensor) -> dict[str, float]:
         "halves": (slopes[:half].mean(0), slopes[half:].mean(0)),
     }
     found = {name: float(torch.cosine_similarity(*pair, dim=0)) for name, pair in pairs.items()}
-    return found | {"ratio": float(mean.norm() / coarse.norm())}
+    chance = (each - slopes).std(0).norm() / len(each) ** 0.5  # standard error of the mean of what they differ by
+    return found | {"ratio": float(mean.norm() / coarse.norm()), "chance": float(chance / coarse.norm())}
 
 
 def measure(args: Args, path: Path) -> Iterator[Row]:
@@ -153,16 +156,17 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each policy; no cosine with differences that do not agree."""
+    """A line for each policy; no cosine with differences that do not agree, or that chance decides."""
     lines = list[Row]()
     for (task, learner), own in grouped(rows, "task", "learner").items():
         line: dict[str, object] = {"task": task, "learner": learner}
         for ground, horizon in (("soft", WINDOWS[-1]), *(("mujoco", k) for k in WINDOWS)):
             found = [row for row in own if (row["ground"], row["horizon"]) == (ground, str(horizon))]
             agree = [row["cosine"] for row in found if float(row["differences"]) > AGREE]
+            agree = [] if any(float(row.get("chance") or 0) > CHANCE for row in found) else agree
             line[f"{'penalty' if ground == 'soft' else 'MuJoCo'}, {horizon} steps"] = agree[0] if agree else ""
-        errors = [float(row["error"]) for row in own if row.get("error")]
-        lines.append(line | {"error in float64": max(errors) if errors else ""})
+        ratio = [row["ratio"] for row in found if row.get("ratio")] if agree else []
+        lines.append(line | {f"ratio, {horizon} steps": ratio[0] if ratio else ""})
     return lines
 
 

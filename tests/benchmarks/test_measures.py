@@ -91,7 +91,7 @@ def test_agreement_of_known_vectors() -> None:
     """The gradient is twice as long as the differences; the halves are perpendicular to each other."""
     slopes = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
     found = gradients.agreement(2 * slopes, slopes, slopes * torch.tensor([1.0, 0.0]))
-    assert found == pytest.approx({"cosine": 1, "differences": 0.5**0.5, "halves": 0, "ratio": 2})
+    assert found == pytest.approx({"cosine": 1, "differences": 0.5**0.5, "halves": 0, "ratio": 2, "chance": 1})
 
 
 def test_gradients_on_each_ground(tmp_path: Path) -> None:
