@@ -156,17 +156,16 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each policy; no cosine with differences that do not agree, or that chance decides."""
+    """A line for each policy on MuJoCo's contact; no cosine that chance decides, or of differences that disagree."""
     lines = list[Row]()
-    for (task, learner), own in grouped(rows, "task", "learner").items():
-        line: dict[str, object] = {"task": task, "learner": learner}
-        for ground, horizon in (("soft", WINDOWS[-1]), *(("mujoco", k) for k in WINDOWS)):
-            found = [row for row in own if (row["ground"], row["horizon"]) == (ground, str(horizon))]
-            agree = [row["cosine"] for row in found if float(row["differences"]) > AGREE]
-            agree = [] if any(float(row.get("chance") or 0) > CHANCE for row in found) else agree
-            line[f"{'penalty' if ground == 'soft' else 'MuJoCo'}, {horizon} steps"] = agree[0] if agree else ""
-        ratio = [row["ratio"] for row in found if row.get("ratio")] if agree else []
-        lines.append(line | {f"ratio, {horizon} steps": ratio[0] if ratio else ""})
+    hard = [row for row in rows if row["ground"] == "mujoco"]
+    for (task, learner), own in grouped(hard, "task", "learner").items():
+        sure = [row for row in own if float(row["differences"]) > AGREE and float(row.get("chance") or 0) < CHANCE]
+        cosines = {int(row["horizon"]): row["cosine"] for row in sure}
+        ratios = {int(row["horizon"]): row.get("ratio", "") for row in sure}
+        line = {f"cosine, {k} steps": cosines.get(k, "") for k in WINDOWS}
+        name = task if learner == "noise" else f"{task}, {learner}"
+        lines.append({"task": name} | line | {"ratio, 8 steps": ratios.get(8, "")})
     return lines
 
 

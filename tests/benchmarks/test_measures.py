@@ -104,6 +104,17 @@ def test_gradients_on_each_ground(tmp_path: Path) -> None:
     assert all(abs(float(row["cosine"])) <= 1 for row in rows) and float(rows[0]["differences"]) > 0.99
 
 
+def test_a_page_shows_no_cosine_that_chance_decides() -> None:
+    row = {"task": "ant", "learner": "noise", "ground": "mujoco", "differences": "0.95", "ratio": "1"}
+    rows = [
+        row | {"horizon": "4", "cosine": "0.8", "chance": "0.1"},
+        row | {"horizon": "8", "cosine": "0.7", "chance": "2"},
+    ]
+    (line,) = gradients.shown([*rows, rows[0] | {"horizon": "16", "differences": "0.5"}, rows[0] | {"ground": "soft"}])
+    cells = {"cosine, 4 steps": "0.8", "cosine, 8 steps": "", "cosine, 16 steps": "", "ratio, 8 steps": ""}
+    assert line == {"task": "ant"} | cells
+
+
 def test_gradients_without_a_name_are_those_of_all_tasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [str(path) for path in gradients.Args().measured] == [*diffsim.TASKS]
     flags = f"go2 --num-envs 4 --horizons 1 --warmup 1 --directions 2 --output {tmp_path}".split()

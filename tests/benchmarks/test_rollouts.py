@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import rollouts
+from common import RESULTS
+from tables import read_csv
 
 from diffsim.extra.report import approximations
 from diffsim.robot.mjcf import load_scene
@@ -37,6 +39,12 @@ def test_a_rollout_is_mujocos(seed: int, monkeypatch: pytest.MonkeyPatch) -> Non
         assert "condim 4 and 6" in told or "corners of a mesh" in told
     else:
         assert row["condim"] <= 3
+
+
+def test_the_page_keeps_its_word() -> None:
+    rows = read_csv(RESULTS / "cpu" / "rollouts.csv")
+    assert len(rows) == rollouts.Args().robots
+    assert all(float(row["error of a step"]) < 1e-9 and float(row["contacts"]) > 0.3 for row in rows)
 
 
 def test_meshes_become_points_and_condim_3() -> None:
