@@ -50,7 +50,6 @@ def test_a_page_has_the_tables_of_the_csv_files(
         ("transfer", "juggler", "was trained elsewhere: unknown task 'juggler': choose from cartpole, hopper"),
         ("transfer", "humanoid_mtu", "humanoid_mtu, whose muscles are not simulated in MuJoCo here"),
         ("robustness", "cartpole", "was trained on cartpole, whose episodes do not end with a fall"),
-        ("gradients", "cartpole", "cartpole has no ground"),
         ("joystick", "hopper", "was trained on hopper, which follows no command"),
         ("tracking", "hopper", "was trained on hopper, which is not judged by its clip's root"),
     ],
