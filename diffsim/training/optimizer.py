@@ -90,8 +90,7 @@ class ClippedAdam:
         parts = PARTS if gradient.is_cuda else 1
         flat = self.vector, gradient, self.exp_avg, self.exp_avg_sq
         vector, grads, first, second = (x.tensor_split(parts) for x in flat)
-        steps = [self.step_count] * parts
-        torch._fused_adam_(vector, grads, first, second, [], steps, **self._adam | scaled)
+        torch._fused_adam_(vector, grads, first, second, [], [self.step_count] * parts, **self._adam | scaled)
 
     def moments(self, parameter: Tensor) -> list[Tensor]:
         """Views of a parameter's moments (numel,), first and second."""
