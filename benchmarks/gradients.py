@@ -1,16 +1,21 @@
-"""What hard contact does to gradients: whether they point where the mean return rises.
+"""Whether gradients point where the mean return rises: of every task, on both contacts.
 
-    python benchmarks/gradients.py runs/learning/ppo_mujoco/*__1        policies of tasks with ground, one of each
-    python benchmarks/gradients.py ant half_cheetah humanoid            tasks, whose robots get noise for actions
+    python benchmarks/gradients.py                                      all tasks, whose robots get noise for actions
+    python benchmarks/gradients.py ant go2                              some of them
+    python benchmarks/gradients.py runs/learning/ppo_mujoco/*__1        policies, one of each task
 
 A policy acts with noise from states that it visits. The reward of a window is differentiated with respect to a shift
 of all of the window's actions: how well its mean over the environments agrees with differences of the mean reward,
-which see jumps that no derivative sees. Differences of two sizes must agree, or the mean reward has no slope to compare
-with. The grounds are the paper's springs and MuJoCo's own contact. Writes gradients.csv.
+which see jumps that no derivative sees. All begin in one state, with its commands, clocks and random numbers. How far
+differences agree among themselves bounds that: by two sizes of the shift, and between two halves of the environments.
+The standard error of what they differ by, relative to the differences, tells how much other environments would change.
+In float64, tiny differences of single environments, which meet no jump, tell whether the derivative itself is right.
+The contacts are the paper's springs, without the robots that have dry friction, and MuJoCo's own. Writes gradients.csv.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,18 +28,19 @@ from tables import Row, grouped
 from torch import Tensor
 
 import diffsim
-from diffsim import DiffEnv
-from diffsim.tasks import find_task
-from diffsim.training import Count, fail
+from diffsim import DiffEnv, SceneError
+from diffsim.training import Count
 from diffsim.training.evaluation import SEED
 
 GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "soft": {"contact": "soft"},
     "mujoco": {"contact": "mujoco"},
 }
-SHOWN = tuple(f"cosine, {k} steps" for k in (4, 8, 16))
+WINDOWS = 4, 8, 16  # control steps
+TINY, FEW = 1e-6, 32  # the shift in float64, and of how many environments at most
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
-AGREE = 0.9  # least cosine of differences by SHIFT and by half of it, for which the page shows others
+AGREE, CHANCE = 0.9, 0.5  # the page shows cosines where differences by SHIFT and by half of it agree better than by
+# the first, and where the standard error is below the second
 KEY = ("task", "learner", "horizon", "ground")
 Policy = Callable[[Tensor], Tensor | float]
 
@@ -42,8 +48,13 @@ Policy = Callable[[Tensor], Tensor | float]
 @dataclass
 class Args(common.CheckpointFlags):
     num_envs: Count = 1024  # environments
-    horizons: tuple[Count, ...] = (2, 4, 8, 16, 32)  # control steps of a window
-    warmup: Count = 150  # control steps before it
+    horizons: tuple[Count, ...] = WINDOWS  # control steps of a window
+    directions: Count = 12  # of the shift, at most: random ones where there are more controls
+    warmup: Count = 150  # control steps before the window
+
+    @property
+    def measured(self) -> tuple[Path, ...]:
+        return () if self.draw_only else self.checkpoints or tuple(map(Path, diffsim.TASKS))
 
 
 def still(obs: Tensor) -> float:
@@ -60,19 +71,57 @@ def window(env: DiffEnv, policy: Policy, horizon: int, shift: Tensor, noise: Ten
     return total
 
 
+def axes(nu: int, most: int) -> Tensor:
+    """(K, nu) orthonormal directions of the shift: the controls themselves, or `most` random ones."""
+    if nu <= most:
+        return torch.eye(nu)
+    return torch.linalg.qr(torch.randn(nu, most, generator=torch.Generator().manual_seed(SEED)))[0].T
+
+
 @torch.no_grad()
-def differences(env: DiffEnv, policy: Policy, horizon: int, noise: Tensor, size: float) -> Tensor:
-    """(nu,) central differences of the mean reward of a window."""
-    start = env.qpos.clone(), env.qvel.clone()
-    slopes = []
-    for k in range(env.scene.nu):
-        shift, ends = torch.zeros_like(noise[0]), []
-        for shift[:, k] in (torch.tensor(size), torch.tensor(-size)):
-            env.set_state(*start)
-            ends.append(window(env, policy, horizon, shift, noise).mean())
+def differences(env: DiffEnv, policy: Policy, noise: Tensor, along: Tensor, size: float) -> Tensor:
+    """(N, K) central differences of each environment's reward of a window, along directions (K, nu) of the shift."""
+    start, slopes = env.state_dict(), []
+    for direction in along.to(noise):
+        ends = []
+        for shift in (size * direction, -size * direction):
+            env.load_state_dict(start)
+            ends.append(window(env, policy, len(noise), shift.expand_as(noise[0]), noise))
         slopes.append((ends[0] - ends[1]) / (2 * size))
-    env.set_state(*start)
-    return torch.stack(slopes)
+    env.load_state_dict(start)
+    return torch.stack(slopes, dim=1)
+
+
+def gradient(env: DiffEnv, policy: Policy, noise: Tensor) -> Tensor:
+    """(N, nu) derivative of each environment's reward of a window with respect to the shift."""
+    shift = torch.zeros_like(noise[0], requires_grad=True)
+    return torch.autograd.grad(window(env, policy, len(noise), shift, noise).sum(), shift)[0]
+
+
+def error(env: DiffEnv, state: dict[str, Any], policy: Policy, noise: Tensor, along: Tensor) -> float:
+    """Median over the environments of env, which is of float64, of the relative error against tiny differences."""
+    own, count = env.state_dict(), env.num_envs
+    batched = {name: x[:count].to(own[name].dtype) for name, x in state.items() if name not in ("task", "generator")}
+    env.load_state_dict(own | batched)
+    wide, policy = noise[:, :count].double(), copy.deepcopy(policy)
+    if isinstance(policy, torch.nn.Module):
+        policy.double()
+    expected = differences(env, policy, wide, along, TINY)
+    found = gradient(env, policy, wide) @ along.double().T
+    return float(((found - expected).norm(dim=1) / expected.norm(dim=1)).nanmedian())
+
+
+def agreement(each: Tensor, slopes: Tensor, finer: Tensor) -> dict[str, float]:
+    """Compare gradients (N, K) with differences of the mean, and these with themselves."""
+    mean, coarse, half = each.mean(0), slopes.mean(0), len(slopes) // 2
+    pairs = {
+        "cosine": (mean, coarse),
+        "differences": (finer.mean(0), coarse),
+        "halves": (slopes[:half].mean(0), slopes[half:].mean(0)),
+    }
+    found = {name: float(torch.cosine_similarity(*pair, dim=0)) for name, pair in pairs.items()}
+    chance = (each - slopes).std(0).norm() / len(each) ** 0.5  # standard error of the mean of what they differ by
+    return found | {"ratio": float(mean.norm() / coarse.norm()), "chance": float(chance / coarse.norm())}
 
 
 def measure(args: Args, path: Path) -> Iterator[Row]:
@@ -81,37 +130,42 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     if task not in diffsim.TASKS:
         case = common.load_case(path, 1, "cpu")
         task, learner, policy = case.env.task.name, case.saved.script, case.saved.network
-    if "contact" not in find_task(task)().scene().features:
-        fail(f"{path}: {task} has no ground")
     for ground, contact in GROUNDS.items():
         options = contact | {"horizon": max(args.horizons), "early_termination": False, "max_episode_steps": 10**9}
-        env = diffsim.make(task, n, **options)  # in which no episode ends: a reset within a window is no slope
+        try:
+            env = diffsim.make(task, n, **options)  # in which no episode ends: a reset within a window is no slope
+            exact = diffsim.make(task, min(n, FEW), **options, dtype=torch.float64, tolerance=1e-10)
+        except SceneError as refusal:
+            print(f"  {str(refusal).partition(' (')[0]}")
+            continue
         env.reset(seed=SEED)
         drawn = torch.Generator().manual_seed(SEED)
         noise = NOISE * torch.randn(args.warmup, n, env.scene.nu, generator=drawn)
         with torch.no_grad():
             window(env, policy, args.warmup, torch.zeros(n, env.scene.nu), noise)
-        start = env.qpos.detach().clone(), env.qvel.detach().clone()
+        start, along = env.state_dict(), axes(env.scene.nu, args.directions)
         for horizon in args.horizons:
             noise = NOISE * torch.randn(horizon, n, env.scene.nu, generator=drawn)
-            env.set_state(*start)
-            slopes, finer = (differences(env, policy, horizon, noise, size) for size in (SHIFT, SHIFT / 2))
-            shift = torch.zeros(n, env.scene.nu, requires_grad=True)
-            (each,) = torch.autograd.grad(window(env, policy, horizon, shift, noise).sum(), shift)
+            env.load_state_dict(start)
+            slopes, finer = (differences(env, policy, noise, along, size) for size in (SHIFT, SHIFT / 2))
+            each = gradient(env, policy, noise)
             row = {"task": task, "learner": learner, "horizon": horizon, "ground": ground}
-            vectors = {"cosine": each.mean(0), "differences": finer}
-            row |= {name: float(torch.cosine_similarity(x, slopes, dim=0)) for name, x in vectors.items()}
+            row |= agreement(each @ along.T, slopes, finer)
+            row["error"] = error(exact, start, policy, noise, along[:4])
             yield row | {"norm": float(each.norm(dim=1).median()), "environments": n}
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each policy on MuJoCo's contact; no cosine with differences that do not agree."""
+    """A line for each policy on MuJoCo's contact; no cosine that chance decides, or of differences that disagree."""
     lines = list[Row]()
     hard = [row for row in rows if row["ground"] == "mujoco"]
     for (task, learner), own in grouped(hard, "task", "learner").items():
-        agree = [row for row in own if float(row["differences"]) > AGREE]
-        cells = {f"cosine, {row['horizon']} steps": row["cosine"] for row in agree}
-        lines.append({"task": task, "learner": learner} | {name: cells.get(name, "") for name in SHOWN})
+        sure = [row for row in own if float(row["differences"]) > AGREE and float(row.get("chance") or 0) < CHANCE]
+        cosines = {int(row["horizon"]): row["cosine"] for row in sure}
+        ratios = {int(row["horizon"]): row.get("ratio", "") for row in sure}
+        line = {f"cosine, {k} steps": cosines.get(k, "") for k in WINDOWS}
+        name = task if learner == "noise" else f"{task}, {learner}"
+        lines.append({"task": name} | line | {"ratio, 8 steps": ratios.get(8, "")})
     return lines
 
 

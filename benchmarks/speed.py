@@ -278,6 +278,22 @@ def iteration(device: str, name: str, learner: str, num_envs: int, horizon: int,
     return {"ms": 1e3 * usual, "launches": Measured.launches, "start (s)": seconds - sum(times[1:])}
 
 
+def shown_iterations(rows: Sequence[Mapping[str, str]]) -> list[Row]:
+    """A learner's techniques side by side: milliseconds of each, launches as a graph and compiled."""
+    cases: dict[tuple[str, ...], dict[str, Mapping[str, str]]] = {}
+    for row in rows:
+        cases.setdefault((row["learner"], row["task"], row["environments"]), {})[row["technique"]] = row
+    table = list[Row]()
+    for (learner, task, environments), by in cases.items():
+        line: dict[str, object] = {"case": f"{learner}, {task}", "environments": environments}
+        line |= {f"{name} (ms)": by[name]["ms"] for name in ("eager", "graph", "compiled") if name in by}
+        if "compiled" in by:
+            line["launches"] = f"{by['graph']['launches']}, {by['compiled']['launches']}"
+            line["start, compiled (s)"] = by["compiled"]["start (s)"]
+        table.append(line)
+    return table
+
+
 def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     """Microseconds of one differentiated control step of one environment, against environments and horizon."""
     panels, unit, speed = list[Panel](), "us per control step, forward + backward", "differentiated control steps/s"
@@ -297,6 +313,7 @@ PARTS: dict[PartName, Part] = {
         ("task", "learner", "environments", "technique"),
         "speed_iteration",
         "performance.md",
+        shown_iterations,
     ),
 }
 

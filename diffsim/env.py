@@ -190,10 +190,8 @@ class DiffEnv(VectorEnv):
         if self.adjoint_clip and qpos.requires_grad:
             qpos, qvel = ClipAdjoint.apply(self.adjoint_clip, qpos, qvel)
         noise = self._uniform(self.num_envs, self.task.num_noise) if self.task.num_memory else self.memory
-        obs, memory, reward, terminated, failed = self._judge(
-            qpos, qvel, action, self.memory, noise, self.sim.nonfinite
-        )
-        return (qpos, qvel, obs, memory), reward, terminated, failed
+        obs, memory, reward, ended, failed = self._judge(qpos, qvel, action, self.memory, noise, self.sim.nonfinite)
+        return (qpos, qvel, obs, memory), reward, ended, failed
 
     def _judge(
         self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor, noise: Tensor, nonfinite: Tensor
@@ -223,18 +221,12 @@ class DiffEnv(VectorEnv):
             self._statistics["return"].addcmul_(done, self._episode_return)
             self._statistics["length"].addcmul_(done, length)
             self._statistics["nonfinite"] += nonfinite
-        final_obs = obs = state[2]
+        obs = state[2]
+        info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
         self._set_state(state)
         if starts is not None:
             self._start_episodes(done, starts)
             obs = self._obs.clone()
-        info = {
-            "final_obs": final_obs,
-            "_final_obs": done,
-            "episode": episode,
-            "_episode": done,
-            "nonfinite": nonfinite,
-        }
         return obs, reward, terminated, truncated, info
 
     def _start_episodes(self, mask: Tensor, starts: State) -> None:

@@ -11,7 +11,7 @@ import sys
 import threading
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import warp as wp
@@ -58,20 +58,16 @@ def start_warp() -> None:
     """
     wp.config.log_level = wp.LOG_WARNING
     if not nvidia_driver():
-        try:
+        with suppress(KernelCacheError):  # repeated when kernels are wanted
             check_kernel_cache()
-        except ValueError:
-            pass  # repeated when kernels are wanted
 
 
 def nvidia_driver() -> bool:
     """Tell whether the library of the NVIDIA driver can be loaded."""
     for name in ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so", "libcuda.so.1"):
-        try:
+        with suppress(OSError):
             ctypes.CDLL(name)
             return True
-        except OSError:
-            pass
     return False
 
 
@@ -128,18 +124,6 @@ def _check_objects(folder: Path) -> None:
             stored.write_text(found)
         elif stored.read_text() not in ("", found):  # empty while another process writes it
             raise ValueError(f"{path} has changed")
-
-
-@contextmanager
-def quick_kernels() -> Iterator[None]:
-    """Compile in half the time kernels that run at a fifth of the speed."""
-    config = wp.config
-    before = config.optimization_level, config.use_precompiled_headers
-    config.optimization_level, config.use_precompiled_headers = 0, False  # headers are compiled for several modules
-    try:
-        yield
-    finally:
-        config.optimization_level, config.use_precompiled_headers = before
 
 
 @contextmanager

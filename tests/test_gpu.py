@@ -21,6 +21,7 @@ from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
+from diffsim.kernels.wide import module_options
 from diffsim.robot.constraint import constrained
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS
@@ -77,6 +78,21 @@ def test_kernels_with_constraints_compile_for_a_gpu_without_one(dtype: type, con
     spec = kernel_spec(scene, divide(scene, 4), dtype, implicit=False, env_last=True, varied=True, constrained=True)
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
         compiled(kernel.module, arch=90)
+
+
+@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
+@pytest.mark.parametrize("env_last", [False, True])
+@pytest.mark.parametrize("hard", [False, True])
+def test_fast_arithmetic_is_that_of_constraints_in_single_precision_on_a_gpu(
+    dtype: type, env_last: bool, hard: bool
+) -> None:
+    soft = task_scene("ant")
+    scene = constrained(soft, 1 / 240) if hard else soft
+    spec = kernel_spec(scene, divide(scene), dtype, implicit=False, env_last=env_last, constrained=hard)
+    fast = (dtype, env_last, hard) == (wp.float32, True, True)
+    assert module_options(spec).get("fast_math", False) is fast
+    for kernel in (forward_kernel(spec), backward_kernel(spec)):
+        assert bool(kernel.module.options["fast_math"]) is fast
 
 
 def episode(

@@ -11,7 +11,7 @@ PACKAGE = Path(diffsim.__file__).parent
 CONTRIBUTING = PACKAGE.parent / "CONTRIBUTING.md"
 # Laws that the core has as features of a KernelSpec, and that the paper's six tasks do without
 OPTIONAL = """kernels/constraint kernels/newton kernels/drag kernels/force kernels/terrain kernels/lanes
-kernels/exchange kernels/cone robot/constraint robot/terrain sim/tangent sim/adjoint sim/elevation""".split()
+kernels/exchange kernels/cone robot/constraint robot/terrain robot/drag sim/tangent sim/adjoint sim/elevation""".split()
 
 
 def lines(*patterns: str) -> int:
@@ -27,7 +27,7 @@ def test_the_core_is_small() -> None:
     )
     simulator = lines("*.py", "robot/*.py", "kernels/*.py", "sim/*.py", "tasks/*.py") - optional
     print(f"simulator {simulator}, harness {harness}, optional laws {optional}, extra {extra}")
-    assert simulator <= 5790 and harness <= 1830
+    assert simulator <= 5790 and harness <= 1850
     (drawing,) = re.findall(r"^An import goes down.*?```\n(.*?)^```$", CONTRIBUTING.read_text(), re.M | re.S)
     drawn = {int(number.replace(",", "")) for number in re.findall(r"\d,\d{3}", drawing)}
     assert drawn == {round(part, -2) for part in (simulator, harness, optional, extra)}

@@ -94,7 +94,7 @@ def test_a_learner_trains(tmp_path, monkeypatch):
 
 def test_quick_kernels_are_of_their_time_alone():
     before = wp.config.optimization_level, wp.config.use_precompiled_headers
-    with pytest.raises(KeyError), startup.quick_kernels():
+    with pytest.raises(KeyError), command.quick_kernels():
         assert (wp.config.optimization_level, wp.config.use_precompiled_headers) == (0, False)
         raise KeyError
     assert before == (wp.config.optimization_level, wp.config.use_precompiled_headers)

@@ -10,6 +10,7 @@ import warp as wp
 
 from diffsim.kernels.lanes import Division
 from diffsim.kernels.spec import KernelSpec
+from diffsim.robot.drag import drag
 from diffsim.robot.scene import Scene
 
 
@@ -184,10 +185,10 @@ FIELDS: dict[str, Field] = {
     "body": ("ints", lambda n: n.bodies[1]),  # MuJoCo's number of the body
     "body_com": ("vec3s", lambda n: n.scene.body_com[n.bodies[1]]),  # m, in the link's frame
     # Drag, see drag.py
-    "drag_frame": ("mat3s", lambda n: n.scene.drag[0][n.link]),  # principal axes in the link's frame
-    "drag_viscous": ("vec3s", lambda n: n.masked(n.scene.drag[1])),  # (a, c, 0)
-    "drag_force": ("vec3s", lambda n: n.masked(n.scene.drag[2])),  # b of each axis
-    "drag_torque": ("vec3s", lambda n: n.masked(n.scene.drag[3])),  # d of each axis
+    "drag_frame": ("mat3s", lambda n: drag(n.scene)[0][n.link]),  # principal axes in the link's frame
+    "drag_viscous": ("vec3s", lambda n: n.masked(drag(n.scene)[1])),  # (a, c, 0)
+    "drag_force": ("vec3s", lambda n: n.masked(drag(n.scene)[2])),  # b of each axis
+    "drag_torque": ("vec3s", lambda n: n.masked(drag(n.scene)[3])),  # d of each axis
     # The ground and the world
     "terrain": ("vec4ss", lambda n: n.terrain),  # (profile, vertex): x, z, unit vector to the next vertex
     "carrier_along": ("real", lambda n: n.scene.root.position[0]),  # m, the carrier's x at q = 0

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from diffsim.robot.scene import Array
 
 Kind = mujoco.mjtObj
-
 MOST_NAMES = 8  # in one message
 
 

@@ -88,11 +88,9 @@ class ClippedAdam:
     def _update(self, gradient: Tensor, **scaled: Any) -> None:
         """Apply Adam along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
         parts = PARTS if gradient.is_cuda else 1
-        vector, grads, avgs, squares = (
-            x.tensor_split(parts) for x in (self.vector, gradient, self.exp_avg, self.exp_avg_sq)
-        )
-        steps = [self.step_count] * parts
-        torch._fused_adam_(vector, grads, avgs, squares, [], steps, **self._adam | scaled)
+        flat = self.vector, gradient, self.exp_avg, self.exp_avg_sq
+        vector, grads, first, second = (x.tensor_split(parts) for x in flat)
+        torch._fused_adam_(vector, grads, first, second, [], [self.step_count] * parts, **self._adam | scaled)
 
     def moments(self, parameter: Tensor) -> list[Tensor]:
         """Views of a parameter's moments (numel,), first and second."""

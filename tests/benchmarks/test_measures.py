@@ -76,11 +76,22 @@ def test_the_gradient_of_a_window_agrees_with_differences() -> None:
     env.reset(seed=0)
     noise = 0.1 * torch.randn(4, 16, env.scene.nu, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     start = env.qpos.clone()
-    slopes = gradients.differences(env, policy, 4, noise, 1e-5)
+    along = gradients.axes(env.scene.nu, 2).double()  # two random directions of three controls
+    torch.testing.assert_close(
+        along @ along.T, torch.eye(2, dtype=torch.float64), rtol=0, atol=1e-6
+    )  # they are of float32
+    slopes = gradients.differences(env, policy, noise, along, 1e-5)
     assert torch.equal(env.qpos, start)
     shift = torch.zeros(16, env.scene.nu, dtype=torch.float64, requires_grad=True)
     (each,) = torch.autograd.grad(gradients.window(env, policy, 4, shift, noise).sum(), shift)
-    torch.testing.assert_close(each.mean(0), slopes, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(each @ along.T, slopes, rtol=1e-4, atol=1e-6)
+
+
+def test_agreement_of_known_vectors() -> None:
+    """The gradient is twice as long as the differences; the halves are perpendicular to each other."""
+    slopes = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    found = gradients.agreement(2 * slopes, slopes, slopes * torch.tensor([1.0, 0.0]))
+    assert found == pytest.approx({"cosine": 1, "differences": 0.5**0.5, "halves": 0, "ratio": 2, "chance": 1})
 
 
 def test_gradients_on_each_ground(tmp_path: Path) -> None:
@@ -89,12 +100,32 @@ def test_gradients_on_each_ground(tmp_path: Path) -> None:
     rows = read_csv(tmp_path / "gradients.csv")
     assert [row["ground"] for row in rows] == [*gradients.GROUNDS]
     assert len({row["norm"] for row in rows}) == len(rows)
+    assert all(float(row["error"]) < 1e-5 for row in rows)
     assert all(abs(float(row["cosine"])) <= 1 for row in rows) and float(rows[0]["differences"]) > 0.99
 
 
-SHELL = '<asset><mesh name="shell" file="shell.stl"/></asset>'
+def test_a_page_shows_no_cosine_that_chance_decides() -> None:
+    row = {"task": "ant", "learner": "noise", "ground": "mujoco", "differences": "0.95", "ratio": "1"}
+    rows = [
+        row | {"horizon": "4", "cosine": "0.8", "chance": "0.1"},
+        row | {"horizon": "8", "cosine": "0.7", "chance": "2"},
+    ]
+    (line,) = gradients.shown([*rows, rows[0] | {"horizon": "16", "differences": "0.5"}, rows[0] | {"ground": "soft"}])
+    cells = {"cosine, 4 steps": "0.8", "cosine, 8 steps": "", "cosine, 16 steps": "", "ratio, 8 steps": ""}
+    assert line == {"task": "ant"} | cells
+
+
+def test_gradients_without_a_name_are_those_of_all_tasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert [str(path) for path in gradients.Args().measured] == [*diffsim.TASKS]
+    flags = f"go2 --num-envs 4 --horizons 1 --warmup 1 --directions 2 --output {tmp_path}".split()
+    gradients.main(parse(gradients.Args, None, flags))
+    assert [row["ground"] for row in read_csv(tmp_path / "gradients.csv")] == ["mujoco"]
+    assert "go2: soft contact has no frictionloss\n" in capsys.readouterr().out
+
 
 # Robots of others -----------------------------------------------------------------------------------------------------
+
+SHELL = '<asset><mesh name="shell" file="shell.stl"/></asset>'
 
 
 def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

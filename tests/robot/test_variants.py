@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from scenes import free_states, parse, random_tree, robot
 
-from diffsim import Integration, Scene, SceneError, Simulator, startup
+from diffsim import Integration, Scene, SceneError, Simulator
+from diffsim.extra.commands import quick_kernels
 from diffsim.extra.report import approximations
 from diffsim.robot.constraint import constrained
 from diffsim.sim import simulator
@@ -168,7 +169,7 @@ def step_error(scene: Scene, states: States) -> float:
     m, count = scene.mj_model, len(states)
     m.opt.timestep = H
     qpos, qvel = (torch.tensor(np.array(x)) for x in zip(*states, strict=True))
-    with startup.quick_kernels(), torch.no_grad(), pytest.MonkeyPatch.context() as patch:
+    with quick_kernels(), torch.no_grad(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulator, "PASSES", 300)
         sim = Simulator(scene, count, Integration("mujoco", 1, tolerance=1e-12), H, dtype=torch.float64)
         found = sim.step(qpos, qvel, torch.full((count, m.nu), 0.3, dtype=torch.float64))[1].numpy()
@@ -284,7 +285,7 @@ ODD = {  # numbers and names that no robot has, by place, with the words that re
     "rest": {
         EXACT: ['<custom><text name="\u96ea \U0001f600" data="\u2028"/></custom>'],
         "repeated name": ['<custom><text name="t" data="a"/><text name="t" data="b"/></custom>'],
-        "a second base": ['<worldbody><body><joint/><geom size="0.1"/></body></worldbody>'],
+        "no other body has joints": ['<worldbody><body><joint/><geom size="0.1"/></body></worldbody>'],
     },
     "root": {EXACT: [f"<freejoint/>{SIXTY}"]},
 }

@@ -22,7 +22,6 @@ import torch
 from learners import PATH, refusal
 
 import diffsim
-from diffsim import startup
 from diffsim.extra import commands as command
 from diffsim.extra.drive import serve as drive
 from diffsim.extra.drive.serve import Handler, Pilot, Server, Stage, Wish
@@ -181,7 +180,7 @@ def fly(pilot: Pilot, seconds: float, wish: Wish) -> np.ndarray:
 @pytest.mark.slow
 def test_each_command_moves_the_robot_its_way():
     saved = load_policy(command.shipped("go2"))
-    with startup.quick_kernels():
+    with command.quick_kernels():
         pilot = Pilot(make_policy_env(saved, 1, forces=True), saved.network)
         for k, sign in ((0, 1), (0, -1), (1, 1), (1, -1), (2, 1), (2, -1)):
             pilot.restart()
@@ -217,7 +216,7 @@ def test_a_turned_robot_on_terrain_has_its_height_over_it() -> None:
 @pytest.mark.slow
 def test_the_ant_turns_to_where_it_is_sent():
     saved, ends = load_policy(command.shipped("ant")), []
-    with startup.quick_kernels():
+    with command.quick_kernels():
         pilot = Pilot(make_policy_env(saved, 1, forces=True), saved.network)
         for turn in (0.0, 1.0, -1.0):
             pilot.env.generator.manual_seed(1)
