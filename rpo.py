@@ -26,30 +26,33 @@ from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, mlp
 from diffsim.training.ranges import Count, Finite, Fraction, NonNegative, Positive, UpTo10k, UpTo1000, Widths
 
-# SHAC's networks and rates, and what our trials of epochs, trust, environments and the critic's passes found.
+# SHAC's networks; the rest was chosen by trials (docs/rpo.md). Environments are those of a CPU, where they cost time.
 # fmt: off
-COLUMNS = ("actor_hidden", "critic_hidden", "actor_lr", "critic_lr", "target_alpha", "num_envs", "horizon",
-           "iterations", "critic_iterations", "epochs", "trust")
+COLUMNS = ("actor_hidden", "critic_hidden", "critic_lr", "target_alpha", "num_envs", "iterations",
+           "critic_iterations", "epochs", "trust")
 PER_TASK = {
-    "cartpole":     ((64, 64),      (64, 64),   1e-2, 1e-3, 0.2,   64, 32,  300, 8, 4, 0.5),
-    "hopper":       ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2, 1024, 32,  400, 8, 8, 1.0),
-    "half_cheetah": ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2, 1024, 32,  600, 8, 4, 0.5),
-    "ant":          ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,  256, 32, 1200, 8, 2, 0.3),
-    "humanoid":     ((256, 128),    (128, 128), 2e-3, 5e-4, 0.9, 1024, 32,  800, 8, 4, 0.5),
-    "humanoid_mtu": ((512, 256),    (256, 256), 2e-3, 5e-4, 0.9, 1024, 32,  600, 8, 4, 0.5),
-    "go2":          ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9, 1024, 16,  300, 4, 4, 0.5),
-    "g1":           ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9, 1024, 16,  600, 4, 4, 0.5),
-    "g1_track":     ((256, 128),    (512, 256), 2e-3, 1e-3, 0.9, 1024, 16,  400, 8, 4, 0.5),
+    "cartpole":     ((64, 64),      (64, 64),   1e-3, 0.2,  64,  300, 8, 4, 0.5),
+    "hopper":       ((128, 64, 32), (64, 64),   2e-3, 0.2, 256,  400, 4, 8, 1.0),
+    "half_cheetah": ((128, 64, 32), (64, 64),   2e-3, 0.2,  64,  600, 8, 4, 0.5),
+    "ant":          ((128, 64, 32), (64, 64),   2e-3, 0.2,  64, 1200, 4, 2, 0.3),
+    "humanoid":     ((256, 128),    (128, 128), 5e-4, 0.9,  64,  800, 4, 4, 0.5),
+    "humanoid_mtu": ((512, 256),    (256, 256), 5e-4, 0.9,  64,  400, 4, 4, 0.5),
+    "go2":          ((256, 128),    (256, 128), 1e-3, 0.9,  64,  400, 4, 4, 0.5),
+    "g1":           ((256, 128),    (256, 128), 1e-3, 0.9,  64,  600, 4, 4, 0.5),
+    "g1_track":     ((256, 128),    (512, 256), 1e-3, 0.9, 256,  400, 8, 4, 0.5),
 }
 PER_TASK |= {"walker": PER_TASK["hopper"], "swimmer": PER_TASK["half_cheetah"], "go1": PER_TASK["go2"]}
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
-CPU = {"num_envs": 64, "critic_iterations": 4}  # at most, where environments cost time in proportion
-ON_CPU: dict[str, dict[str, Any]] = {"g1_track": {"critic_hidden": (256, 128), "iterations": 800}}
+SOME, MANY = {"num_envs": 256}, {"num_envs": 1024}
+ON_GPU = {"half_cheetah": SOME, "ant": SOME} | dict.fromkeys(("go1", "go2", "g1", "g1_track"), MANY)
+ON_GPU |= dict.fromkeys(("hopper", "humanoid", "humanoid_mtu", "humanoid_imitation"), MANY | {"critic_iterations": 8})
+INTEGRATION = {"ant": {"substeps": 8, "implicit": True}}  # SAPO's cheaper steps
+INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), {"substeps": 16, "implicit": True})
 MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}  # MuJoCo's contact, whose gradients agree over few steps
 # Robots with servos, on MuJoCo's contact, begin near their standing pose: little noise, actions near zero.
-STANDING = dict.fromkeys(("go1", "go2", "g1", "g1_track"), {"initial_log_std": -2.0, "adjoint_clip": 5.0})
+BEGIN = {"horizon": 16, "initial_log_std": -2.0, "adjoint_clip": 5.0}
+STANDING = dict.fromkeys(("go1", "go2", "g1", "g1_track"), BEGIN)
 # fmt: on
-RATIO_TRUST = 0.2  # with --bound ratio, in place of the table's
 GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
 CRITIC_MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
 MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of both optimizers; Adam's decay rates of the gradient's moments
@@ -74,11 +77,11 @@ class Args(Flags):
     epochs: UpTo1000 = 4
     """passes of the actor over a rollout's samples and their gradients (per task)"""
     minibatches: UpTo1000 = 4
-    """minibatches of such a pass, each a step of the actor on its share of the environments"""
+    """minibatches of such a pass, each a step of the actor on a share of the environments"""
     bound: Literal["distance", "ratio", "none"] = "distance"
     """what ends the reuse of a sample: how far its action has moved, or how much its probability has changed"""
     trust: Positive = 0.3
-    """the bound, in standard deviations of an action, or of the probabilities' ratio from 1 (per task and --bound)"""
+    """the bound, in standard deviations of an action, or of the probabilities' ratio from 1 (per task)"""
     kl_coef: NonNegative = 0.0
     """weight of the KL divergence from the policy that acted, in the loss"""
     critic_hidden: Widths = (128, 128)
@@ -96,19 +99,18 @@ class Args(Flags):
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
-        if self.device == "cpu":
-            values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
-            values |= ON_CPU.get(self.task, {})
+        if self.device != "cpu":
+            values |= ON_GPU.get(self.task, {})
+        if (self.accuracy, self.contact) == ("default", "soft"):
+            values |= INTEGRATION.get(self.task, {})
         if self.contact == "mujoco" and self.task not in STANDING:
             values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
-        if self.bound == "ratio":
-            values["trust"] = RATIO_TRUST
         return super().task_defaults() | values | STANDING.get(self.task, {})
 
     def check(self) -> None:
         super().check()
-        if CRITIC_MINIBATCHES > self.num_envs * self.horizon:
-            fail(f"--num-envs {self.num_envs} with --horizon {self.horizon} are too few samples for the critic")
+        if self.minibatches > self.num_envs:
+            fail(f"--minibatches {self.minibatches} are more than the {self.num_envs} environments that they share")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -171,7 +173,8 @@ class RPO:
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS)
         self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
-        self.deviation = next(p for name, p in self.actor.named_parameters() if "log_std" in name)  # also with a mirror
+        # The deviation's own numbers, also where log_std is computed from them (--symmetric).
+        (self.deviation,) = (p for name, p in self.actor.named_parameters() if "log_std" in name)
 
     def make_alike(self) -> None:
         """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
@@ -204,9 +207,7 @@ class RPO:
 
         # Several epochs on these numbers. Nothing of the simulator is needed any more.
         obs = normalizer(rollout.obs.detach())
-        with torch.no_grad():
-            samples = Batch(obs, self.actor.mean(obs), eps, gradient)
-        metrics = self.fit_actor(samples, std)
+        metrics = self.fit_actor(Batch(obs, self.actor.mean(obs).detach(), eps, gradient), std)
 
         # The critic is fitted to the TD(lambda) returns, and the target critic follows.
         value = td_lambda(rollout.reward.detach(), next_value.detach(), rollout.done, GAMMA, LAMBDA)
@@ -231,20 +232,19 @@ class RPO:
         The deviation keeps its first step only, as in SHAC. Each further one would shrink the noise again along the
         same samples, and with it the bound: learning would end early.
         """
-        parts = min(self.args.minibatches, self.env.num_envs)
         args, optimizer, metrics, once = self.args, self.actor_optimizer, list[Tensor](), list[Tensor]()
-        for _ in range(args.epochs):
-            for part in torch.randperm(self.env.num_envs, device=old_std.device).tensor_split(parts):
-                b = Batch(*(tensor[:, part] for tensor in samples))
-                mean, std = self.actor.mean(b.obs), self.actor.log_std.exp()
-                change, beyond = surrogate(args.bound, args.trust, b, mean, std, old_std)
-                kl = kl_divergence(b.mean, old_std, mean, std)
-                gradient = optimizer.gradient(parts * change + args.kl_coef * kl)
-                metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
-                once = once or [self.deviation.detach().clone()]
+        parts = [Batch(*part) for part in zip(*(x.tensor_split(args.minibatches, dim=1) for x in samples), strict=True)]
+        for b in parts * args.epochs:
+            mean, std = self.actor.mean(b.obs), self.actor.log_std.exp()
+            change, beyond = surrogate(args.bound, args.trust, b, mean, std, old_std)
+            kl = kl_divergence(b.mean, old_std, mean, std)
+            gradient = optimizer.gradient(args.minibatches * change + args.kl_coef * kl)
+            metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
+            once = once or [self.deviation.detach().clone()]
         self.deviation.detach().copy_(once[0])
-        names = "losses/approx_kl", "losses/clipfrac", "grad/norm"
-        return dict(zip(names, torch.stack(metrics).mean(0), strict=True))
+        return dict(
+            zip(("losses/approx_kl", "losses/clipfrac", "grad/norm"), torch.stack(metrics).mean(0), strict=True)
+        )
 
     def fit_critic(self, obs: Tensor, value: Tensor) -> Tensor:
         """Fit V to values (B, 1) of normalized observations (B, obs_dim); returns the mean loss of the last pass."""
@@ -262,10 +262,10 @@ class RPO:
 def surrogate(bound: str, trust: float, b: Batch, mean: Tensor, std: Tensor, old_std: Tensor) -> tuple[Tensor, Tensor]:
     """Sum over samples what moving their actions changes in J, to first order; and the share beyond the bound.
 
-    distance: an action u follows the policy, mean + std eps, and gains nothing by more than `trust` deviations.
+    distance: an action u follows the policy, mean + std eps, and gains nothing by more than `trust` deviations; none:
+    without that bound.
     ratio: u stays, the policy passes through it with other noise, and its gradient counts pi(u|s) / pi_old(u|s) times,
     or not at all where this ratio is off 1 by more than `trust`.
-    none: as distance, without the bound.
     """
     u = b.mean + old_std * b.eps
     if bound == "ratio":

@@ -165,7 +165,7 @@ def test_the_deviation_moves_once_per_rollout(flags: tuple[str, ...]) -> None:
     [
         "--num-envs 1 --horizon 4 --minibatches 1 --bound ratio --kl-coef 0.1",
         "--num-envs 5 --horizon 5 --minibatches 3 --epochs 1 --bound none",
-        "--num-envs 2 --contact soft --implicit --substeps 2 --threads 1",
+        "--num-envs 2 --minibatches 2 --contact soft --implicit --substeps 2 --threads 1",
     ],
 )
 def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
@@ -175,8 +175,25 @@ def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
     assert all(weight.isfinite().all() for part in ("actor", "critic") for weight in modules[part].values())
 
 
-def test_the_bound_has_a_trust_of_its_own() -> None:
-    for words, trust in (("", 0.3), ("--bound ratio", rpo.RATIO_TRUST), ("--bound ratio --trust 0.1", 0.1)):
-        assert parse(rpo.Args, f"--env ant --device cpu {words}".split()).trust == trust
+def test_on_mujocos_contact_rollouts_are_shorter() -> None:
     soft, firm = (parse(rpo.Args, f"--env ant --device cpu --contact {c}".split()) for c in ("soft", "mujoco"))
     assert (soft.horizon, soft.num_envs) == (32, 64) and (firm.horizon, firm.num_envs, firm.trust) == (8, 256, 0.2)
+
+
+def test_minibatches_have_the_gradient_of_all_samples_on_average() -> None:
+    learner, b, old_std, _ = fitted("--minibatches", "2")
+    optimizer, taken = learner.actor_optimizer, list[Tensor]()
+
+    def keep(gradient: Tensor) -> Tensor:
+        taken.append(gradient)
+        return gradient.norm()
+
+    def change(part: rpo.Batch) -> Tensor:
+        mean, std = learner.actor.mean(part.obs), learner.actor.log_std.exp()
+        return rpo.surrogate("distance", learner.args.trust, part, mean, std, old_std)[0]
+
+    whole = optimizer.gradient(change(b))
+    optimizer.step, learner.args.epochs = keep, 1
+    learner.fit_actor(b, old_std)
+    assert len(taken) == 2
+    torch.testing.assert_close(torch.stack(taken).mean(0), whole)
