@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.sim.integration import Integration
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, mlp
@@ -46,8 +47,8 @@ PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 SOME, MANY = {"num_envs": 256}, {"num_envs": 1024}
 ON_GPU = {"half_cheetah": SOME, "ant": SOME} | dict.fromkeys(("go1", "go2", "g1", "g1_track"), MANY)
 ON_GPU |= dict.fromkeys(("hopper", "humanoid", "humanoid_mtu", "humanoid_imitation"), MANY | {"critic_iterations": 8})
-INTEGRATION = {"ant": {"substeps": 8, "implicit": True}}  # SAPO's cheaper steps
-INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), {"substeps": 16, "implicit": True})
+INTEGRATION = {"ant": Integration("soft", 8, implicit=True)}  # SAPO's cheaper steps
+INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), Integration("soft", 16, implicit=True))
 MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}  # MuJoCo's contact, whose gradients agree over few steps
 # Robots with servos, on MuJoCo's contact, begin near their standing pose: little noise, actions near zero.
 BEGIN = {"horizon": 16, "initial_log_std": -2.0, "adjoint_clip": 5.0}
@@ -101,8 +102,8 @@ class Args(Flags):
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
         if self.device != "cpu":
             values |= ON_GPU.get(self.task, {})
-        if (self.accuracy, self.contact) == ("default", "soft"):
-            values |= INTEGRATION.get(self.task, {})
+        if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
+            _, values["substeps"], values["implicit"], _ = INTEGRATION[self.task]
         if self.contact == "mujoco" and self.task not in STANDING:
             values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
         return super().task_defaults() | values | STANDING.get(self.task, {})
@@ -223,7 +224,6 @@ class RPO:
             "grad/skipped": self.actor_optimizer.skipped + self.critic_optimizer.skipped,
             "charts/std": self.actor.log_std.detach().exp().mean(),
             "charts/actor_lr": self.actor_optimizer.lr,
-            "charts/critic_lr": self.critic_optimizer.lr,
         }
 
     def fit_actor(self, samples: Batch, old_std: Tensor) -> dict[str, Tensor]:

@@ -25,7 +25,7 @@ PPO_LOSSES = " ".join(  # by CleanRL's names
 )
 SCALARS = {
     "shac": "losses/actor losses/critic charts/actor_lr charts/critic_lr",
-    "rpo": ("losses/actor losses/critic losses/approx_kl losses/clipfrac charts/std charts/actor_lr charts/critic_lr"),
+    "rpo": "losses/actor losses/critic losses/approx_kl losses/clipfrac charts/std charts/actor_lr",
     "sapo": (
         "losses/actor losses/critic charts/actor_lr charts/critic_lr charts/reward charts/entropy charts/temperature"
     ),
