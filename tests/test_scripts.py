@@ -115,9 +115,8 @@ def test_files_of_a_run(script, trained, checkpoint):
     arguments = json.loads((trained / "args.json").read_text())
     assert arguments["num_envs"] == 3 and arguments["substeps"] == 4
     hidden, lr = ("actor_hidden", "actor_lr") if "actor_lr" in arguments else ("hidden", "lr")
-    assert arguments[hidden] == [64, 64] and arguments[lr] == (
-        3e-4 if script.__name__ in ("ppo_baseline", "pfpn") else 1e-2
-    )
+    rates = {"ppo_baseline": 3e-4, "pfpn": 3e-4, "rpo": 2e-3}
+    assert arguments[hidden] == [64, 64] and arguments[lr] == rates.get(script.__name__, 1e-2)
     assert list(arguments) == [field.name for field in dataclasses.fields(script.Args)]
     assert arguments == json.loads(json.dumps(checkpoint["args"])) | {"run_dir": str(trained)}
 
