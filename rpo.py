@@ -108,11 +108,6 @@ class Args(Flags):
             values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
         return super().task_defaults() | values | STANDING.get(self.task, {})
 
-    def check(self) -> None:
-        super().check()
-        if self.minibatches > self.num_envs:
-            fail(f"--minibatches {self.minibatches} are more than the {self.num_envs} environments that they share")
-
 
 # Networks -------------------------------------------------------------------------------------------------------------
 
@@ -233,12 +228,13 @@ class RPO:
         same samples, and with it the bound: learning would end early.
         """
         args, optimizer, metrics, once = self.args, self.actor_optimizer, list[Tensor](), list[Tensor]()
-        parts = [Batch(*part) for part in zip(*(x.tensor_split(args.minibatches, dim=1) for x in samples), strict=True)]
+        count = min(args.minibatches, self.env.num_envs)
+        parts = [Batch(*part) for part in zip(*(x.tensor_split(count, dim=1) for x in samples), strict=True)]
         for b in parts * args.epochs:
             mean, std = self.actor.mean(b.obs), self.actor.log_std.exp()
             change, beyond = surrogate(args.bound, args.trust, b, mean, std, old_std)
             kl = kl_divergence(b.mean, old_std, mean, std)
-            gradient = optimizer.gradient(args.minibatches * change + args.kl_coef * kl)
+            gradient = optimizer.gradient(count * change + args.kl_coef * kl)
             metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
             once = once or [self.deviation.detach().clone()]
         self.deviation.detach().copy_(once[0])

@@ -24,7 +24,6 @@ import pfpn
 import pfpn_sac
 import pods
 import ppo_baseline
-import rpo
 import sac_baseline
 import sapo
 import shac
@@ -140,7 +139,6 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp
         (mbpo, "--env humanoid_imitation --sample-enhance 4", "do not hold the past, on which humanoid_imitation"),
         *((x, "--env cartpole:mass=0.9:1.1", "one robot on a plane, but cartpole:mass=0.9:1.1") for x in (gps, pods)),
         (pods, "--env cartpole --horizon 100", "--horizon 100 does not divide the 240 control steps of an episode"),
-        (rpo, "--num-envs 3", "--minibatches 4 are more than the 3 environments that they share"),
         (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
         (pfpn, "--lr-bounds 1e-2 1e-3", "must be two numbers, the first not above the second, not (0.01, 0.001)"),
         *((pfpn, f"--initial-log-std {x}", f"--initial-log-std must be from -5 to 2, not {x}") for x in ("nan", "2.5")),
