@@ -200,7 +200,7 @@ class DiffEnv(VectorEnv):
         failed = nonfinite.clone()
         if self.task.num_memory:
             memory = self.task.remember(memory, action, noise)
-        obs = self._observe(qpos, qvel, action, memory)
+        obs = self.observe(qpos, qvel, action, memory)
         reward = self.task.reward(obs, action).masked_fill(failed, 0.0)
         with torch.no_grad():
             ended = self.task.terminated(obs) if self.early_termination else self.task.over(obs)
@@ -326,14 +326,11 @@ class DiffEnv(VectorEnv):
         self._obs = self.observe(self.qpos, self.qvel, self._no_action)
         return self._obs.clone()
 
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """Return the task's observation (N, obs_dim) of states, with its memory."""
-        return self._observe(qpos, qvel, action, self.memory)
-
-    def _observe(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor | None = None) -> Tensor:
+        """Return the task's observation (N, obs_dim) of states, with a memory, by default the present one."""
         if self.task.ground is not None:
             qpos = self.task.ground.lower(qpos)
-        return self.task.observe_with(qpos, qvel, action, memory)
+        return self.task.observe_with(qpos, qvel, action, self.memory if memory is None else memory)
 
     def state_dict(self) -> dict[str, Any]:
         """Return a dictionary that continues the episodes exactly, without the simulator's factors and forces."""

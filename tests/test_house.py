@@ -27,7 +27,7 @@ def test_the_core_is_small() -> None:
     )
     simulator = lines("*.py", "robot/*.py", "kernels/*.py", "sim/*.py", "tasks/*.py") - optional
     print(f"simulator {simulator}, harness {harness}, optional laws {optional}, extra {extra}")
-    assert simulator <= 5790 and harness <= 1850
+    assert simulator <= 5790 and harness <= 1830
     (drawing,) = re.findall(r"^An import goes down.*?```\n(.*?)^```$", CONTRIBUTING.read_text(), re.M | re.S)
     drawn = {int(number.replace(",", "")) for number in re.findall(r"\d,\d{3}", drawing)}
     assert drawn == {round(part, -2) for part in (simulator, harness, optional, extra)}

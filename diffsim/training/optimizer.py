@@ -11,8 +11,6 @@ from torch import Tensor, nn
 from diffsim.training import distributed
 from diffsim.training.errors import fail
 
-# The kernel takes 65,536 numbers of a tensor in one block of threads: on a GPU more tensors keep more of it busy.
-PARTS = 32
 PLAIN: dict[str, Any] = dict(weight_decay=0.0, eps=1e-8, amsgrad=False, maximize=False)  # torch.optim.Adam's defaults
 
 
@@ -87,10 +85,10 @@ class ClippedAdam:
 
     def _update(self, gradient: Tensor, **scaled: Any) -> None:
         """Apply Adam along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
-        parts = PARTS if gradient.is_cuda else 1
-        flat = self.vector, gradient, self.exp_avg, self.exp_avg_sq
-        vector, grads, first, second = (x.tensor_split(parts) for x in flat)
-        torch._fused_adam_(vector, grads, first, second, [], [self.step_count] * parts, **self._adam | scaled)
+        parts = 32 if gradient.is_cuda else 1  # the kernel has a block of threads for 65,536 numbers of a tensor
+        numbers = self.vector, gradient, self.exp_avg, self.exp_avg_sq
+        state: Any = *(x.tensor_split(parts) for x in numbers), [], [self.step_count] * parts
+        torch._fused_adam_(*state, **self._adam | scaled)
 
     def moments(self, parameter: Tensor) -> list[Tensor]:
         """Views of a parameter's moments (numel,), first and second."""

@@ -34,6 +34,7 @@ from diffsim.training.layers import ObsNormalizer
 
 L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
+Iterate = Callable[[], Metrics]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
 REPORTED = {  # totals that are reported each time they double
@@ -104,7 +105,6 @@ class Run:
         self._variation: Any = None
         self._samples = 0  # control steps of an iteration, of all ranks
         self._learner: Learner | None = None
-        self._compiled: list[DiffEnv | nn.Module] = []
         self._normalizers: list[ObsNormalizer] = []  # of observations
         self._log: ProgressLog | None = None
         self._records: list[Record] = []
@@ -116,8 +116,7 @@ class Run:
         self._reported = dict.fromkeys(REPORTED, 0.0)
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
-        self._opened = False
-        self._stopping = False
+        self._opened = self._stopping = False
 
     # Setting up ------------------------------------------------------------------------------------------------------
 
@@ -158,22 +157,18 @@ class Run:
         All ranks start with equal weights; from here on they draw different random numbers.
         """
         self._learner, rank = learner, distributed.rank()
-        modules = (
-            module for part in vars(learner).values() if isinstance(part, nn.Module) for module in part.modules()
-        )
+        modules = nn.ModuleList(part for part in vars(learner).values() if isinstance(part, nn.Module)).modules()
         self._normalizers = [m for m in modules if isinstance(m, ObsNormalizer) and m.size is not None]
         if rank > 0:
             torch.manual_seed(self.args.seed + rank * RANK_SEED)
         if state := self._state:
             own = state["ranks"][rank]
-            episodes = (self._env, own["env"]) if self._env is not None else None
-            if state["args"]["env"] != self.args.env and not FILE.fullmatch(self.args.env):
-                episodes = None  # which stand on another clip's frames or on other ground: new ones begin
+            same = state["args"]["env"] == self.args.env or FILE.fullmatch(self.args.env)  # or new episodes begin
+            episodes = (self._env, own["env"]) if self._env is not None and same else None
             checkpoint.restore(learner, state, episodes)
             if self.writes:
-                pkgutil.resolve_name(checkpoint.PROVENANCE).compare(
-                    state.get("robot"), (self._env or self.eval_env).scene
-                )
+                compare = pkgutil.resolve_name(checkpoint.PROVENANCE).compare
+                compare(state.get("robot"), (self._env or self.eval_env).scene)
             self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]
@@ -181,15 +176,13 @@ class Run:
             self._episodes.windows.extend(state["episodes"])
         return learner
 
-    def capture(
-        self, function: Callable[[], Metrics], env: DiffEnv | None = None, eager: bool = False
-    ) -> Callable[[], Metrics]:
+    def capture(self, function: Iterate, env: DiffEnv | None = None, eager: bool = False) -> Iterate:
         """Time an iteration, or a part of it, as time/{name}; on a GPU, unless eager, its calls replay one CUDA graph.
 
         See graph.capture.
         """
         if self.args.compile:
-            self._compile(env)
+            function = pkgutil.resolve_name("diffsim.extra.fuse:fused")(function, self._learner, env)
         call = graph.capture(function, self.device, env) if self.graphs and not eager else function
 
         def timed() -> Metrics:
@@ -199,21 +192,10 @@ class Run:
             except ActionError:
                 self._check_learner()  # they say more
                 raise
-            except Exception as error:
-                if self.args.compile and type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
-                    fail(f"--compile: torch.compile failed, train without it: {str(error).strip().splitlines()[0]}")
-                raise
             self._times[f"time/{function.__name__}"] = begin, Mark(self.device)
             return metrics
 
         return timed
-
-    def _compile(self, env: DiffEnv | None) -> None:
-        """Compile the environment's step and the learner's networks, each once."""
-        for part in (env, *vars(self._learner).values()):
-            if isinstance(part, DiffEnv | nn.Module) and part not in self._compiled:
-                self._compiled.append(part)
-                part.compile(**({"dynamic": False} if isinstance(part, nn.Module) else {}))
 
     # Iterating -------------------------------------------------------------------------------------------------------
 
