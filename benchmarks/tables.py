@@ -46,7 +46,8 @@ def origin(device: str = "cpu") -> str:
         machine = torch.cuda.get_device_name(device)
     packages = {"torch": "torch", "warp": "warp-lang", "mujoco": "mujoco"}
     versions = ", ".join(f"{name} {metadata.version(package)}" for name, package in packages.items())
-    command = shlex.join(["python", os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
+    words = (Path(word).name if os.path.isabs(word) else word for word in sys.argv[1:])  # no paths of this machine
+    command = shlex.join(["python", os.path.relpath(sys.argv[0], ROOT), *words])
     return f"# {machine}; python {platform.python_version()}, {versions}; revision {revision()}; {command}\n"
 
 

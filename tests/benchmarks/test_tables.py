@@ -80,6 +80,11 @@ def test_the_repository_is_changed_on_demand_alone(tmp_path, monkeypatch, capsys
     assert error.endswith("--output and --update-results exclude each other")
 
 
+def test_a_command_has_no_path_of_its_machine(monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(tables.ROOT / "benchmarks" / "speed.py"), "--runs", "/home/me/runs", "--env"])
+    assert tables.origin.__wrapped__().endswith("; python benchmarks/speed.py --runs runs --env\n")
+
+
 def test_results_of_unknown_origin_are_refused(monkeypatch, capsys):
     known = "# 2 cores of a CPU; python 3.11, torch 2.13; revision 1dd159e; python speed.py --runs unknown-dirty\n"
     assert tables.unknown(known) == ""
