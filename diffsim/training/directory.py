@@ -10,6 +10,7 @@ import os
 import socket
 import sys
 import tempfile
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -39,11 +40,10 @@ def check_writable(directory: Path) -> None:
 def make_unused(wanted: Path) -> Path:
     """Make a directory of this name, or with a number behind it where the name is taken."""
     for number in itertools.count(2):
-        try:
+        with suppress(FileExistsError):
             wanted.mkdir(parents=True)
             return wanted
-        except FileExistsError:
-            wanted = wanted.with_name(f"{wanted.name.partition('.')[0]}.{number}")
+        wanted = wanted.with_name(f"{wanted.name.partition('.')[0]}.{number}")
     raise AssertionError
 
 
@@ -63,6 +63,7 @@ def lock(directory: Path) -> TextIO:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in (errno.EACCES, errno.EAGAIN):  # others: the file system has no locks
+                time.sleep(0.5)  # it may have got the lock just now, and writes its name next
                 file.seek(0)
                 fail(f"{directory} is in use by {file.read().strip()}: wait for its end, or choose another --run-dir")
     file.truncate(0)

@@ -162,13 +162,12 @@ class Run:
         if rank > 0:
             torch.manual_seed(self.args.seed + rank * RANK_SEED)
         if state := self._state:
-            own = state["ranks"][rank]
+            own, robot = state["ranks"][rank], state.get("robot")
             same = state["args"]["env"] == self.args.env or FILE.fullmatch(self.args.env)  # or new episodes begin
             episodes = (self._env, own["env"]) if self._env is not None and same else None
             checkpoint.restore(learner, state, episodes)
             if self.writes:
-                compare = pkgutil.resolve_name(checkpoint.PROVENANCE).compare
-                compare(state.get("robot"), (self._env or self.eval_env).scene)
+                pkgutil.resolve_name(checkpoint.PROVENANCE).compare(robot, (self._env or self.eval_env).scene)
             self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]
