@@ -45,14 +45,17 @@ PER_TASK = {
 PER_TASK |= {"walker": PER_TASK["hopper"], "swimmer": PER_TASK["half_cheetah"], "go1": PER_TASK["go2"]}
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 SOME, MANY = {"num_envs": 256}, {"num_envs": 1024}
-ON_GPU = {"half_cheetah": SOME, "ant": SOME} | dict.fromkeys(("go1", "go2", "g1", "g1_track"), MANY)
+ON_GPU = {"half_cheetah": SOME, "ant": SOME | {"critic_iterations": 16}}
+ON_GPU["cartpole"] = SOME | {"critic_iterations": 16, "critic_lr": 2e-3}
+ON_GPU |= dict.fromkeys(("go1", "go2", "g1", "g1_track"), MANY)
 ON_GPU |= dict.fromkeys(("hopper", "humanoid", "humanoid_mtu", "humanoid_imitation"), MANY | {"critic_iterations": 8})
 INTEGRATION = {"ant": Integration("soft", 8, implicit=True)}  # SAPO's cheaper steps
 INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), Integration("soft", 16, implicit=True))
 MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}  # MuJoCo's contact, whose gradients agree over few steps
 # Robots with servos, on MuJoCo's contact, begin near their standing pose: little noise, actions near zero.
 BEGIN = {"horizon": 16, "initial_log_std": -2.0, "adjoint_clip": 5.0}
-STANDING = dict.fromkeys(("go1", "go2", "g1", "g1_track"), BEGIN)
+STANDING = dict.fromkeys(("go1", "go2"), BEGIN)
+STANDING |= dict.fromkeys(("g1", "g1_track"), BEGIN | {"initial_log_std": -3.0})
 # fmt: on
 GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
 CRITIC_MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
