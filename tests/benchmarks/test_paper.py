@@ -52,7 +52,7 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
     assert not paper.Cell("cpu", "shac_fast", "cartpole", 1).timed and paper.Cell("cpu", "shac", "cartpole", 1).timed
     some = list(paper.wanted(paper.Args(only=("headline", "large_batch"), env=("humanoid",), seeds=(2, 4))))
     assert {(cell.learner, cell.seed) for cell in some} == {
-        *((learner, seed) for learner in ("shac", "sapo", "ppo_4096") for seed in (2, 4)),
+        *((learner, seed) for learner in ("rpo", "shac", "sapo", "ppo_4096") for seed in (2, 4)),
         ("sac_large", 2),
     }
     (cell,) = (cell for cell in some if cell.learner == "sac_large")
@@ -143,17 +143,18 @@ def test_what_is_missing_is_said_with_its_command(known: list[dict[str, str]]) -
     args = paper.Args(only=("headline",), env=("hopper",))
     *lines, count = paper.check(args).splitlines()
     assert lines == [
+        "h200: python rpo.py --env hopper --seed {1 2 3 4 5} --device cuda",
         "h200: python shac.py --env hopper --seed {1 2 3 4 5} --device cuda",
         "h200: python ppo_baseline.py --env hopper --seed {1 2 3 4 5} --device cuda "
         "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --iterations 1200",
         "h200: python sapo.py --env hopper --seed {3} --device cuda",
     ]
-    assert count == "11 of 15 cells are missing"
+    assert count == "16 of 20 cells are missing"
 
 
 def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     error = refusal(lambda: paper.main(paper.Args(only=("headlines",))), capsys)
-    assert "--only: there is no 'headlines'; choose from headline, cores" in error
+    assert "--only: there is no 'headlines'; choose from headline, steps_ant" in error
     error = refusal(lambda: paper.main(paper.Args(learners=("SHAC",))), capsys)
     assert "--learners: there is no 'SHAC'; choose from shac, shac_no_critic" in error
     monkeypatch.setattr(tables, "revision", lambda: "1234567-dirty")
