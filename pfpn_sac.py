@@ -241,10 +241,10 @@ def straight_through(mixture: Mixture) -> Draw:
 def implicit(mixture: Mixture) -> Draw:
     """Samples whose gradient has no bias.
 
-    In locations and scales it is the chosen component's, in the weights the implicit one (Figurnov et al. 2018,
-    https://arxiv.org/abs/1805.08498). Few samples fall between two narrow particles, where that is large. Therefore a
-    second sample has one of the m actions from all of (-1, 1). The entropy's gradient in the weights is that of the
-    choice's probability, less what the temperature steers log pi of an action to, which is 1.
+    The value's is implicit (Figurnov et al. 2018, https://arxiv.org/abs/1805.08498). Few samples fall between narrow
+    particles, where that is large. Therefore a second sample has one of the m actions from all of (-1, 1). The
+    entropy's is the chosen component's in locations and scales, and the score function's in the weights, less what the
+    temperature steers log pi of an action to, which is 1.
     """
     noise, chosen = torch.randn_like(mixture.logits[..., 0]), mixture.choose()
     u = mixture.pick(chosen, noise)
@@ -254,16 +254,16 @@ def implicit(mixture: Mixture) -> Draw:
     one = F.one_hot(torch.randint(m, u.shape[:-1], device=u.device), m)
     other = torch.where(one > 0, torch.logit(torch.rand_like(u), eps=1e-7) / 2, drawn)
     log_pi = log_pi + score - score.detach()
-    return Draw(u + shift(mixture, drawn), log_pi.sum(-1), other + one * shift(mixture, other))
+    return Draw(drawn + shift(mixture, drawn), log_pi.sum(-1), other + one * shift(mixture, other))
 
 
 def shift(mixture: Mixture, u: Tensor) -> Tensor:
-    """0 (B, m), with u's gradient in the weights where the cumulative probability of u stays: du = -dF / p(u).
+    """0 (B, m), with the gradient that u has if its cumulative probability F(u) stays: du = -dF / p(u).
 
     Both samples of `implicit` divide by the sum of the densities with which they come (Veach's balance heuristic),
     p(u) and that of a constant density 1/2 of actions, for one of m. So the gradient of tanh u is at most 2m times dF.
     """
-    z = (u.unsqueeze(-1) - mixture.loc.detach()) * (-mixture.log_std.detach()).exp()
+    z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()
     cumulative = (mixture.log_weight.exp() * torch.special.ndtr(z)).sum(-1)
     density = mixture.log_density(u).detach().exp() + log_slope(u).exp() / (2 * u.shape[-1])
     return (cumulative.detach() - cumulative) / density
