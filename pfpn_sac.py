@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -46,7 +46,6 @@ PER_TASK = {
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation of a component
 MAX_GRAD_NORM = 100.0  # sac_baseline.py's
 TAU = 0.005  # target critics <- (1 - tau) target critics + tau critics, after each update
-DENSITY = 0.01  # of an action, at least, in the implicit gradient
 
 
 @dataclass
@@ -115,9 +114,13 @@ class Mixture:
         noise = torch.randn_like(self.logits[..., 0])
         if self.logits.shape[-1] == 1:  # a Gaussian
             return self.loc.squeeze(-1) + self.log_std.exp().squeeze(-1) * noise
+        return self.pick(self.choose(), noise)
+
+    def choose(self) -> Tensor:
+        """A component (..., m, 1) by its weight."""
         total = self.logits.detach().softmax(-1).cumsum(-1)
-        level = (1 - torch.rand_like(noise).unsqueeze(-1)) * total[..., -1:]
-        return self.pick((total < level).sum(-1, keepdim=True), noise)
+        level = (1 - torch.rand_like(total[..., :1])) * total[..., -1:]
+        return (total < level).sum(-1, keepdim=True)
 
     def pick(self, index: Tensor, noise: Tensor) -> Tensor:
         """u (..., m) of the components (..., m, 1), with the gradient of their locations and scales."""
@@ -208,7 +211,21 @@ class Actor(nn.Module):
         return nn.Sequential(self.normalizer, *self.body, self.head.linear, *likeliest, nn.Tanh())
 
 
-def straight_through(mixture: Mixture) -> Tensor:
+class Draw(NamedTuple):
+    """What SAC descends with: samples, whose gradients together are that of their mean."""
+
+    u: Tensor  # (B, m)
+    log_prob: Tensor  # (B,) of it
+    other: Tensor | None = None  # (B, m), of which only the gradient counts
+
+
+def reparameterised(mixture: Mixture) -> Draw:
+    """A sample of a Gaussian."""
+    u = mixture.sample()
+    return Draw(u, mixture.log_prob(u))
+
+
+def straight_through(mixture: Mixture) -> Draw:
     """A sample whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
     noise = torch.randn_like(mixture.logits[..., 0])
     scores = mixture.logits - torch.empty_like(mixture.logits).exponential_().log()  # Gumbel noise
@@ -217,19 +234,39 @@ def straight_through(mixture: Mixture) -> Tensor:
     x = scores.softmax(-1)  # Concrete distribution of temperature 1
     gap = torch.tanh(each) - torch.tanh(u.detach()).unsqueeze(-1)
     gap = gap / log_slope(u.detach()).exp().clamp(min=1e-3).unsqueeze(-1)  # of u, for the same gap of actions
-    return u + (gap * (x - x.detach())).sum(-1)
+    u = u + (gap * (x - x.detach())).sum(-1)
+    return Draw(u, mixture.log_prob(u))
 
 
-def implicit(mixture: Mixture) -> Tensor:
-    """A sample whose gradient has no bias: its cumulative probability F(u) stays, so du = -dF / p(u).
+def implicit(mixture: Mixture) -> Draw:
+    """Samples whose gradient has no bias.
 
-    Figurnov et al. 2018, https://arxiv.org/abs/1805.08498. Where few actions are drawn, p has a floor.
+    The value's is implicit (Figurnov et al. 2018, https://arxiv.org/abs/1805.08498). Few samples fall between narrow
+    particles, where that is large. Therefore a second sample has one of the m actions from all of (-1, 1). The
+    entropy's is the chosen component's in locations and scales, and the score function's in the weights, less what the
+    temperature steers log pi of an action to, which is 1.
     """
-    u = mixture.sample().detach()
+    noise, chosen = torch.randn_like(mixture.logits[..., 0]), mixture.choose()
+    u = mixture.pick(chosen, noise)
+    log_pi = mixture.log_density(u) - log_slope(u)
+    score = (log_pi.detach() - 1) * mixture.log_weight.gather(-1, chosen).squeeze(-1)
+    drawn, m = u.detach(), u.shape[-1]
+    one = F.one_hot(torch.randint(m, u.shape[:-1], device=u.device), m)
+    other = torch.where(one > 0, torch.logit(torch.rand_like(u), eps=1e-7) / 2, drawn)
+    log_pi = log_pi + score - score.detach()
+    return Draw(drawn + shift(mixture, drawn), log_pi.sum(-1), other + one * shift(mixture, other))
+
+
+def shift(mixture: Mixture, u: Tensor) -> Tensor:
+    """0 (B, m), with the gradient that u has if its cumulative probability F(u) stays: du = -dF / p(u).
+
+    Both samples of `implicit` divide by the sum of the densities with which they come (Veach's balance heuristic),
+    p(u) and that of a constant density 1/2 of actions, for one of m. So the gradient of tanh u is at most 2m times dF.
+    """
     z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()
     cumulative = (mixture.log_weight.exp() * torch.special.ndtr(z)).sum(-1)
-    density = torch.maximum(mixture.log_density(u).detach(), math.log(DENSITY) + log_slope(u)).exp()
-    return u - (cumulative - cumulative.detach()) / density
+    density = mixture.log_density(u).detach().exp() + log_slope(u).exp() / (2 * u.shape[-1])
+    return (cumulative.detach() - cumulative) / density
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
@@ -302,7 +339,7 @@ class SAC:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         estimator = straight_through if args.estimator == "straight-through" else implicit
-        self.sample = Mixture.sample if args.policy == "gaussian" else estimator
+        self.draw = reparameterised if args.policy == "gaussian" else estimator
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.actor = Actor(args, env).to(env.device)
         self.policy = self.actor.deterministic()
@@ -368,16 +405,17 @@ class SAC:
 
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
-        mixture = self.actor(obs)
-        u = self.sample(mixture)
-        density = mixture.log_prob(u)
+        u, log_pi, other = self.draw(self.actor(obs))
         value = self.critics.value(obs, torch.tanh(u)).amin(0)
-        loss = (self.temperature["log"].detach().exp() * density - value).mean()
+        loss = (self.temperature["log"].detach().exp() * log_pi - value).mean()
+        if other is not None:
+            value = self.critics.value(obs, torch.tanh(other)).amin(0)
+            loss = loss - (value - value.detach()).mean()
         norm = self.optimizer.step(self.optimizer.gradient(loss))
-        surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
+        surplus = u.shape[-1] - log_pi.detach().mean()  # of entropy over the target
         weighted = self.temperature["log"].exp() * surplus
         self.temperature_optimizer.step(self.temperature_optimizer.gradient(weighted))
-        return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
+        return {"losses/actor": loss.detach(), "charts/entropy": -log_pi.detach().mean(), "grad/norm": norm}
 
 
 # The run --------------------------------------------------------------------------------------------------------------

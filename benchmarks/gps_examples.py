@@ -4,6 +4,8 @@
         --critic-lr 1e-3 --run-dir runs/walker
     python benchmarks/gps_examples.py --env walker --run runs/walker --to diffsim/assets/examples/walker.npz
     python benchmarks/gps_examples.py --env swimmer --settle 200 --to diffsim/assets/examples/swimmer.npz
+    python benchmarks/gps_examples.py --exchange diffsim/assets/examples/walker.npz \
+        --to benchmarks/plans/walker_both.npz
 
 The tasks here have gps.py's reward and control steps, and a fall ends an episode. The swimmer's controller is a
 travelling wave, a formula.
@@ -14,11 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
-from diffsim.extra.planning import System, save_demonstration
+from diffsim.extra.mirror import partners
+from diffsim.extra.planning import System, load_demonstration, save_demonstration
 from diffsim.extra.robots.walker import Walker
 from diffsim.tasks.hopper import Hopper
 from diffsim.tasks.humanoid import Humanoid
@@ -74,7 +78,9 @@ class Args:
     to: Path  # the file, an .npz
     env: str = "walker"  # task of gps.py
     run: Path | None = None  # of any script, whose policy acts
-    switch: float = 0.0  # m/s by which the policy sees its speed too high in the second half, so that it walks slower
+    exchange: Path | None = (
+        None  # in place of a run: a recorded motion, which is written with that of the other leg first
+    )
     terrain: tuple[str, ...] = ("level",)  # a trajectory over each, by the names of gps_variants.py
     steps: int = 520  # control steps
     settle: int = 0  # control steps before, from a start that is moved by 0.1 in all coordinates: of a cycle
@@ -92,6 +98,17 @@ def wave(x: Tensor) -> Tensor:
     return torch.stack((first, second), -1)
 
 
+def exchanged(system: System, path: Path) -> tuple[Tensor, Tensor]:
+    """States (2, T + 1, nx) and actions (2, T, nu) of a planar robot's motion, and with its legs exchanged."""
+    m, sides = system.scene.mj_model, (("right_", "left_"),)
+    joints = partners([m.joint(k).name for k in range(m.njnt)], sides)
+    motors = partners([m.actuator(k).name for k in range(m.nu)], sides)
+    with np.load(path) as file:
+        ((x, u),) = load_demonstration(system, path, len(file["action"]))
+    other = x[:, [*joints, *(system.nq + k for k in joints)]]
+    return torch.stack((x, other)).float(), torch.stack((u, u[:, motors])).float()
+
+
 @command
 def main(args: Args) -> None:
     import gps_variants  # shac.py, which takes tasks from this file, would not find it
@@ -99,6 +116,8 @@ def main(args: Args) -> None:
     words = ["--env", args.env, "--device", "cpu", "--demonstration", str(args.to)]
     flags = parse(gps_variants.VariantArgs, words)
     search = gps_variants.Search(flags, make_env(flags, 1))
+    if args.exchange:
+        return save_demonstration(search.system, *exchanged(search.system, args.exchange), args.to)
     if not args.run and args.env != "swimmer":
         fail(f"--run must be the directory of a run: only the swimmer has a formula, not {args.env}")
     policy = load_policy(args.run / "checkpoint.pt").network.double() if args.run else None
@@ -110,9 +129,7 @@ def main(args: Args) -> None:
         def act(t: int, x: Tensor, system: System = system) -> Tensor:
             if policy is None:
                 return wave(x)
-            seen = x.clone()
-            seen[:, system.nq] += args.switch * (2 * t >= args.steps)
-            return torch.atanh(policy(system.observe(seen)[:, :inputs]).clamp(-0.995, 0.995))
+            return torch.atanh(policy(system.observe(x)[:, :inputs]).clamp(-0.995, 0.995))
 
         start = system.start()
         if args.settle:

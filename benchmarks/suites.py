@@ -53,6 +53,7 @@ class Suite(NamedTuple):
     cells: dict[str, str]  # flags by the cells' names
     groups: dict[str, list[tuple[list[str], list[int], str]]]  # cells, seeds, and their script, task and other flags
     across: bool = False  # one table of all groups
+    unshown: tuple[str, ...] = ()  # groups that the page has no table of
     machine: str = "cpu"  # the folder of results/ that has the csv file
 
 
@@ -146,7 +147,7 @@ def main(args: Args) -> None:
             if not args.train_only and (found := line(suite, case.folder)):
                 args.keep(suite.csv, {"group": group, "cell": cell, "seed": case.seed} | found, KEY)
         rows = args.read(suite.csv) or read_csv(args.directory.parent / suite.machine / f"{suite.csv}.csv")
-        args.publish(*shown(group, rows), suite.page, everywhere=True)
+        args.publish(*shown(group, rows), "" if group in suite.unshown else suite.page, everywhere=True)
 
 
 if __name__ == "__main__":

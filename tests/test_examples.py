@@ -19,6 +19,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+import tables
 import torch
 import worlds
 from learners import PATH, ROOT
@@ -75,6 +76,31 @@ def test_system_identification(truth: dict[str, float], monkeypatch: pytest.Monk
     assert estimates.shape == (13, 2) and estimates[0].tolist() == [1, 1]
     for estimate, factor in zip(estimates[-1].tolist(), truth.values(), strict=True):
         assert estimate == pytest.approx(factor, rel=0.05)
+
+
+def test_landscape(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Losses of the policy as it is do not depend on how many other values of the weight are tried."""
+    module = load("landscape")
+    monkeypatch.setattr(module, "STEPS", 20)
+    few, many = (
+        module.measure(module.Args(points=points, trajectories=3), tiny_run / "checkpoint.pt") for points in (3, 5)
+    )
+    assert few == many[::2] and [row["change"] for row in few] == [-1.0, 0.0, 1.0]
+    assert all(len({row[loss] for row in many}) == 5 for loss in ("long", "window"))
+    assert module.lowest([3.0, 1.0, 2.0, 0.0, 5.0]) == [0, 1, 0, 1, 0]
+    module.main(module.Args(checkpoints=(tiny_run,), points=3, trajectories=3, output=tmp_path))
+    assert len(tables.read_csv(tmp_path / "landscape.csv")) == 3 and (tmp_path / "landscape.png").is_file()
+
+
+def test_bandit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Particles begin evenly; what they learn is tested in tests/test_pfpn.py."""
+    module = load("bandit")
+    monkeypatch.setattr(module, "ITERATIONS", (0, 2))
+    module.main(module.Args(seeds=(1, 2), output=tmp_path))
+    rows = tables.read_csv(tmp_path / "bandit.csv")
+    assert [(row["policy"], row["seed"]) for row in rows] == [(p, s) for p in module.POLICIES for s in ("1", "2")]
+    assert all(row["both"] == "1" for row in rows if row["policy"] != "gaussian")
+    assert (tmp_path / "bandit.png").is_file()
 
 
 @pytest.mark.slow

@@ -62,13 +62,13 @@ def test_density_far_from_every_particle_is_finite_as_is_its_gradient(script: An
     [pfpn.Mixture.sample, pfpn_sac.Mixture.sample, pfpn_sac.straight_through, pfpn_sac.implicit],
     ids=["ppo", "sac", "gumbel", "implicit"],
 )
-def test_draws_follow_the_density(sample: Callable[[Any], Tensor]) -> None:
+def test_draws_follow_the_density(sample: Callable[[Any], Any]) -> None:
     """Kolmogorov and Smirnov's distance of 100,000 draws of each action, which do not depend on each other."""
     logits, loc, log_std = parameters()
     kind = pfpn.Mixture if sample is pfpn.Mixture.sample else pfpn_sac.Mixture
     with torch.no_grad():
         mixture = kind(logits.expand(100_000, M, N), loc, log_std)
-        draws, again = sample(mixture), sample(mixture)
+        draws, again = (x if isinstance(x, Tensor) else x.u for x in (sample(mixture), sample(mixture)))
         u = draws.sort(0).values
         z = (u.unsqueeze(-1) - loc) / log_std.exp()
         cumulative = (logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
@@ -127,7 +127,7 @@ def test_straight_through_gradient() -> None:
     """Eq. 25: of locations and scales that of the chosen one; of logits the gaps times the gradient of the choice."""
     inputs = parameters()
     torch.manual_seed(5)
-    u = pfpn_sac.straight_through(pfpn_sac.Mixture(*inputs))
+    u = pfpn_sac.straight_through(pfpn_sac.Mixture(*inputs)).u
     torch.manual_seed(5)
     noise = torch.randn(M, dtype=torch.float64).unsqueeze(-1)
     scores = inputs[0].log_softmax(-1) - torch.empty(M, N, dtype=torch.float64).exponential_().log()
@@ -143,7 +143,7 @@ def test_straight_through_gradient() -> None:
     torch.testing.assert_close(gradients[0].sum(-1), torch.zeros(M, dtype=torch.float64))
 
 
-def test_the_implicit_gradient_has_no_bias() -> None:
+def test_the_implicit_gradient_of_several_actions_has_no_bias() -> None:
     """Of the mean of a curved function of the action, against quadrature; the straight-through one points elsewhere."""
     logits, loc, log_std = inputs = parameters()
     torch.manual_seed(0)
@@ -157,7 +157,8 @@ def test_the_implicit_gradient_has_no_bias() -> None:
     cosines = {}
     for sample in (pfpn_sac.implicit, pfpn_sac.straight_through):
         drawn = sample(pfpn_sac.Mixture(logits.expand(400_000, M, N), loc, log_std))
-        found = torch.autograd.grad(curved(drawn).mean(), inputs)
+        parts = [drawn.u] if drawn.other is None else [drawn.u, drawn.other]
+        found = torch.autograd.grad(torch.stack([curved(u).mean() for u in parts]).sum(), inputs)
         cosines[sample] = [
             torch.cosine_similarity(a.flatten(), b.flatten(), 0) for a, b in zip(exact, found, strict=True)
         ]
@@ -166,13 +167,60 @@ def test_the_implicit_gradient_has_no_bias() -> None:
     assert min(cosines[pfpn_sac.implicit]) > 0.995 and cosines[pfpn_sac.straight_through][0] < 0.8
 
 
+OF_AN_ACTION: dict[str, Callable[[Tensor], Tensor]] = {
+    "linear": lambda a: a,
+    "quadratic": torch.square,
+    "two peaks": lambda a: sum((-50 * (a - peak).square()).exp() for peak in (-0.25, 0.75)),  # type: ignore[return-value]
+    "sine": lambda a: torch.sin(3 * a),
+}
+
+
+def one_action(case: str) -> list[Tensor]:
+    """Logits, locations and log standard deviations (1, n): many narrow particles of unequal weight, or two."""
+    torch.manual_seed(0)
+    n, deviation = {"35 of 0.03": (35, 0.03), "35 of 0.01": (35, 0.01), "2 of 0.2": (2, 0.2)}[case]
+    loc = torch.tensor([[-1.0, 1.0]]).double() if n == 2 else pfpn_sac.spread(1, n)[0].double()
+    logits = 3 * torch.randn(1, n, dtype=torch.float64) if n > 2 else torch.tensor([[0.3, -0.3]]).double()
+    return [x.requires_grad_() for x in (logits, loc, torch.full_like(loc, math.log(deviation)))]
+
+
+@pytest.mark.parametrize("function", [*OF_AN_ACTION, "entropy"])
+@pytest.mark.parametrize("case", ["35 of 0.03", "35 of 0.01", "2 of 0.2"])
+def test_the_implicit_gradient_is_that_of_quadrature(case: str, function: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its mean over all that it draws, with empty places between narrow particles; to 1e-6 of the gradient's norm."""
+    logits, loc, log_std = inputs = one_action(case)
+    n, points = logits.shape[1], 2001 if logits.shape[1] > 2 else 20_001
+    noise = torch.linspace(-9, 9, points, dtype=torch.float64)
+    index, count = torch.arange(n).repeat_interleave(points), n * points  # each normal number of each component
+    chance = (logits.detach().softmax(-1)[0, :, None] * (-noise.square() / 2).exp()).flatten()
+    chance /= chance.sum()
+    evenly = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    monkeypatch.setattr(pfpn_sac.Mixture, "choose", lambda _: index[:, None, None])
+    monkeypatch.setattr(torch, "randn_like", lambda _: noise.repeat(n)[:, None])
+    monkeypatch.setattr(torch, "rand_like", lambda _: evenly[:, None])
+    u, log_prob, other = pfpn_sac.implicit(pfpn_sac.Mixture(logits.expand(count, 1, n), loc, log_std))
+    assert other is not None
+
+    grid = torch.linspace(-12, 12, 400_001, dtype=torch.float64)[:, None]
+    mixture = pfpn_sac.Mixture(*inputs)
+    density = mixture.log_density(grid).exp()
+    if function == "entropy":
+        mean, exact = chance @ log_prob, density * (mixture.log_density(grid) - pfpn_sac.log_slope(grid))
+    else:
+        f = OF_AN_ACTION[function]
+        mean = chance @ f(torch.tanh(u[:, 0])) + f(torch.tanh(other[:, 0])).mean()
+        exact = density * f(torch.tanh(grid))
+    found = torch.autograd.grad(mean, inputs)
+    for own, expected in zip(found, torch.autograd.grad(exact.sum() * 24 / 400_000, inputs), strict=True):
+        assert (own - expected).norm() < 1e-6 * expected.norm() + 1e-14
+
+
 def test_the_implicit_gradient_is_bounded_where_few_actions_are_drawn() -> None:
-    """Between two narrow particles F is the left one's weight, and the density that of the floor."""
-    logits, loc = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True), torch.tensor([[-1.0, 1.0]]).double()
-    mixture = pfpn_sac.Mixture(logits, loc, torch.full_like(loc, -4.0))
-    mixture.sample = lambda: torch.zeros(1, dtype=torch.float64)  # type: ignore[method-assign]
-    (slope,) = torch.autograd.grad(pfpn_sac.implicit(mixture).sum(), logits)
-    torch.testing.assert_close(slope, torch.tensor([[-0.25, 0.25]]).double() / pfpn_sac.DENSITY)
+    """Between two narrow particles F is the left one's weight, and of two actions one in two is drawn evenly."""
+    logits, loc = torch.zeros(1, 2, 2, dtype=torch.float64, requires_grad=True), torch.tensor([[-1.0, 1.0]]).double()
+    mixture = pfpn_sac.Mixture(logits, loc.expand(2, 2), torch.full_like(loc, -4.0).expand(2, 2))
+    (slope,) = torch.autograd.grad(pfpn_sac.shift(mixture, torch.zeros(1, 2, dtype=torch.float64)).sum(), logits)
+    torch.testing.assert_close(slope, 4 * torch.tensor([[[-0.25, 0.25]] * 2]).double())
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------

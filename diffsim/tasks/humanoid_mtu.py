@@ -28,7 +28,7 @@ class HumanoidMTU(Locomotion):
     joint_spread = 0.0
     observe_action = False
     target = 10_000.0
-    sides = (("R_", "L_"), ("R", "L"))
+    mirrored_by = None  # the left big toe is where the little toes should be
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Return Eq. 23: R_v + 0.1 R_up + R_heading + R_height - 0.001 |a|^2, a activations, R_height of Eqs. 24-25."""

@@ -8,7 +8,7 @@ import gps_examples
 import numpy as np
 import pytest
 import torch
-from learners import SMALL, refusal, run
+from learners import ROOT, SMALL, refusal, run
 
 import diffsim
 import gps
@@ -42,19 +42,27 @@ def test_tasks_of_examples_have_the_reward_of_gps(task: type[gps_examples.Hopper
 
 
 def test_a_recorded_policy(tmp_path: Path) -> None:
-    """Its states follow from its actions; in the second half it may see another speed, and acts otherwise."""
+    """Its states follow from its actions."""
     run(shac, tmp_path / "run", *SMALL["shac"])
-    found = []
-    for name, switch in (("one", 0.0), ("other", 5.0)):
-        words = dict(to=tmp_path / f"{name}.npz", env="cartpole", run=tmp_path / "run", steps=12)
-        gps_examples.main(gps_examples.Args(**words, switch=switch))  # type: ignore[arg-type]
-        system = System(diffsim.make("cartpole", 1))
-        ((x, u),) = load_demonstration(system, tmp_path / f"{name}.npz", 12)
-        played, _, _ = system.rollout(x[:1], 12, lambda t, _, u=u: u[t : t + 1])
-        torch.testing.assert_close(played[0], x, rtol=0.0, atol=1e-5)
-        found.append(u)
-    one, other = found
-    assert torch.equal(one[:6], other[:6]) and (one[6:] != other[6:]).any()
+    gps_examples.main(gps_examples.Args(to=tmp_path / "one.npz", env="cartpole", run=tmp_path / "run", steps=12))
+    system = System(diffsim.make("cartpole", 1))
+    ((x, u),) = load_demonstration(system, tmp_path / "one.npz", 12)
+    played, _, _ = system.rollout(x[:1], 12, lambda t, _: u[t : t + 1])
+    torch.testing.assert_close(played[0], x, rtol=0.0, atol=1e-5)
+
+
+def test_the_other_leg_first(tmp_path: Path) -> None:
+    """The shipped walks begin in one state with different actions, and both are motions of the robot."""
+    gps_examples.main(gps_examples.Args(to=tmp_path / "both.npz", exchange=gps.EXAMPLES / "walker.npz"))
+    args = parse(gps.Args, ["--env", "walker", "--device", "cpu", "--demonstration", str(tmp_path / "both.npz")])
+    search = gps.Search(args, make_env(args, 1))
+    one, other = search.examples()
+    shipped = ROOT / "benchmarks" / "plans" / "walker_both.npz"
+    for (x, u), (_, *found) in zip(load_demonstration(search.system, shipped, args.horizon), (one, other), strict=True):
+        torch.testing.assert_close([x, u], found)
+    assert torch.equal(one[1][0], other[1][0]) and (one[2][0] - other[2][0]).abs().max() > 0.5
+    plans = [search.plan(*each) for each in (one, other)]
+    torch.testing.assert_close(plans[0].cost, plans[1].cost, rtol=1e-9, atol=0.0)
 
 
 def test_a_swimmer_swims_forward(tmp_path: Path) -> None:

@@ -11,8 +11,10 @@ import diffsim
 from diffsim.extra.gait import trace
 from diffsim.extra.mirror import reflections
 from diffsim.tasks import TASKS
+from diffsim.tasks.humanoid_mtu import HumanoidMTU
+from diffsim.tasks.locomotion import Locomotion
 
-MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1", "g1_track")
+MIRRORED = ("ant", "humanoid", "go1", "go2", "g1", "g1_track")
 
 
 @pytest.mark.parametrize("name, dtype, tolerance", [("ant", torch.float32, 3e-5), ("humanoid", torch.float64, 1e-12)])
@@ -38,16 +40,33 @@ def test_the_image_moves_like_the_robot(name: str, dtype: torch.dtype, tolerance
     assert (trace(env.scene, state[0].double().numpy())[0].max(1) > 0).sum() > 1  # so the ground pushed
 
 
-def test_muscles_change_places_with_their_mirror_images() -> None:
-    """Their paths in the reference configuration. A mirror turns the sign of y, and of no pull.
+class Muscles(HumanoidMTU):
+    """Paired by names, as if it had an image."""
 
-    In the benchmark's model, which the asset follows, the left big toe is where the little toes should be.
-    """
-    m, mirror = TASKS["humanoid_mtu"].load_robot().mj_model, TASKS["humanoid_mtu"]().mirror
+    mirrored_by, sides = Locomotion.mirrored_by, (("R_", "L_"), ("R", "L"))
+
+
+def test_muscles_change_places_with_their_mirror_images() -> None:
+    """Their paths in the reference configuration, not those of toes. A mirror turns the sign of y, and of no pull."""
+    m, mirror = Muscles.load_robot().mj_model, Muscles().mirror
     mujoco.mj_kinematics(m, data := mujoco.MjData(m))
     paths = [data.site_xpos[m.wrap_objid[m.tendon_adr[t] :][: m.tendon_num[t]]] for t in m.actuator_trnid[:, 0]]
     apart = [abs(paths[k] * (1, -1, 1) - paths[partner]).max() for k, partner in enumerate(mirror.action.index)]
     assert np.median(apart) < 1e-6 and np.mean(np.array(apart) < 1e-6) > 0.8 and mirror.action.sign.eq(1).all()
+
+
+@torch.no_grad()
+def test_the_robot_of_muscles_has_no_image() -> None:
+    """Its left foot has the toes in the other order, so one step moves the image 0.1 rad/s and more another way."""
+    env, mirror = diffsim.make("humanoid_mtu", 4, horizon=1, dtype=torch.float64), Muscles(dtype=torch.float64).mirror
+    env.reset(seed=0)
+    action = torch.rand(4, env.scene.nu, dtype=torch.float64, generator=env.generator)
+    _, qvel = env.sim.step(env.qpos, env.qvel, action)
+    _, image = env.sim.step(mirror.qpos(env.qpos), mirror.qvel(env.qvel), mirror.action(action))
+    assert (mirror.qvel(qvel) - image).abs().amax(1).min() > 0.1
+    m = env.scene.mj_model
+    right, left, other = (m.body(name).pos[1] for name in ("FootThumbR", "FootThumbL", "FootPinkyL"))
+    assert abs(-right - other) < 0.01 < abs(-right - left)
 
 
 @pytest.mark.parametrize("name", MIRRORED)
