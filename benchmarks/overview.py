@@ -65,8 +65,9 @@ def compared(found: dict[tuple[str, str], Row]) -> Iterator[Row]:
             line: dict[str, object] = {"task": task}
             for learner, row in own.items():
                 times = row["s to target"], row["steps to target"]
-                reached = "not" if "never" in times else f"{times[0]} s, {str(times[1]).replace(' M', ' M')}"
-                line[MAIN[learner]] = f"{float(str(row['return']).split()[0]):,.0f}<br>{reached}"
+                reached = "not" if "never" in times else f"{times[0]} s, {times[1]}"
+                mark = str(row["learner"]).removeprefix(learner).upper()
+                line[MAIN[learner] + mark] = f"{float(str(row['return']).split()[0]):,.0f}<br>{reached}"
             yield line
 
 

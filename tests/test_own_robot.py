@@ -54,7 +54,14 @@ def test_the_page_is_short_and_lists_the_example() -> None:
     assert len(PAGE.split()) <= 750 and LISTING in (ROOT / "examples" / "own_robot.py").read_text()
     assert LISTING.count("\n") <= 30 and "class RunForward(Task):" in LISTING
     first = "-m", "ppo_baseline.py", "view.py", "ppo_baseline.py", "ppo_baseline.py"
-    assert [words[0] for words in COMMANDS] == [*first, "clone", "shac.py", "-m", "examples/own_quadruped.py"]
+    assert [words[0] for words in COMMANDS] == [
+        *first,
+        "clone",
+        "shac.py",
+        "install",
+        "-m",
+        "examples/own_quadruped.py",
+    ]
 
 
 @pytest.mark.slow
@@ -132,7 +139,7 @@ def test_a_robot_of_menagerie_and_its_onnx(tmp_path: Path, monkeypatch: pytest.M
     shutil.copy(ASSETS / "stage.xml", folder)
     monkeypatch.chdir(tmp_path)
     file = str(ROOT / "examples" / "own_quadruped.py")
-    _, train, export, play = COMMANDS[5:]
+    _, train, _, export, play = COMMANDS[5:]
     assert train[2] == export[-1] == f"{Path(file).parent.name}/{Path(file).name}" == play[0]
     tiny = "--iterations 1 --num-envs 4 --horizon 4 --run-dir run".split()
     shac.main(["--env", file, *tiny, *FEW])

@@ -57,7 +57,7 @@ CLOSER = {
 FLOOR, AROUND = 4.0, 4.8  # m after which the floor repeats; s that a robot with a clock takes for it, in whole cycles
 DANCE = 12.6, 5.0  # s of the clip that a film of tracking begins with, and how many it shows
 LEAST_FPS, QUALITY = 25.0, 40  # of a film; WebP's, of 100
-SPACING = 1.2  # m between the robots of a batch
+SPACING = 1.5  # m between the robots of a batch
 ROW, LABELS = 16, 56  # pixels of a foot's line in the diagram, and of its name
 INK, PAPER, PALE = (40, 46, 58), (255, 255, 255), (226, 230, 236)
 
@@ -243,7 +243,7 @@ def gait(
 
 
 def batch(
-    checkpoint: Positional[Path], count: int = 36, seconds: float = 4.0, size: tuple[int, int] = (800, 450)
+    checkpoint: Positional[Path], count: int = 36, seconds: float = 4.0, size: tuple[int, int] = (640, 360)
 ) -> None:
     """A film of many environments of one batch, each at its place of a grid, called <task>_batch.webp.
 
@@ -264,7 +264,7 @@ def batch(
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     model.vis.map.shadowclip *= side  # the light sees all of them
     data, option, pert, camera = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 1.05 * side * SPACING
+    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.95 * side * SPACING
     spread = SPACING * (np.arange(side) - (side - 1) / 2)
     places = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2)
     rows[:, :, :2] += places[:, None] - rows[:, :1, :2]  # each starts at its place
