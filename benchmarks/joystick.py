@@ -247,7 +247,7 @@ def main(args: Args) -> None:
         return
     rows = measured(args, Part("joystick", measure, key, "joystick", PAGE, table))
     args.publish("whole", tables.markdown(whole(rows)), PAGE)
-    args.publish("gaits", tables.markdown(gaits(rows)), PAGE)
+    print(tables.markdown(gaits(rows)))
 
 
 if __name__ == "__main__":

@@ -34,7 +34,8 @@ from diffsim.training import Count
 PartName = Literal["presets", "extremes", "promise"]
 ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again
 PROMISED = ("robot", "chosen", "error", "error on 200 others", "speed", "default's error")
-SHOWN = ("task", "preset", "setting", "speed", "state 0.5 s", "gradient 8", "gradient 32")
+SHOWN = ("speed", "state 0.5 s", "gradient 32")
+PRESETS = ("task", *get_args(Accuracy))
 
 
 @dataclass
@@ -82,13 +83,22 @@ def labelled(rows: list[Cells]) -> list[Cells]:
     return lines
 
 
-def presets(rows: list[Cells]) -> list[Row]:
+def presets(rows: list[Cells]) -> list[Cells]:
     """A line for each preset, by task, the fastest first."""
     lines = sorted(
         (row for row in labelled(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
     )
     lines = [row | {"setting": row["setting"].removesuffix(" substeps")} for row in lines]
     return [row for own in grouped(lines, "task").values() for row in own]
+
+
+def shown(rows: list[Cells]) -> list[Row]:
+    """A line for each task: of each preset the setting, then the speed and the errors of the state and the gradient."""
+    lines = list[Row]()
+    for (task,), own in grouped(presets(rows), "task").items():
+        told = {row["preset"]: ", ".join(row[name] for name in SHOWN) for row in own}
+        lines.append({"task": task} | {row["preset"]: f"{row['setting']}<br>{told[row['preset']]}" for row in own})
+    return lines
 
 
 def measure_extremes(args: Args, robot: str) -> Iterator[Row]:
@@ -140,9 +150,9 @@ def draw(args: Args, rows: list[Cells]) -> None:
 
 PAGE = "numerics.md"
 PARTS: dict[PartName, Part] = {
-    "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, presets, SHOWN),
-    "extremes": Part("numerics_extremes", measure_extremes, ("task", "sweep"), "extremes", PAGE, bounds),
-    "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", PAGE, columns=PROMISED),
+    "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, shown, PRESETS),
+    "extremes": Part("numerics_extremes", measure_extremes, ("task", "sweep"), "extremes", shown=bounds),
+    "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", columns=PROMISED),
 }
 
 

@@ -124,11 +124,16 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
         calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
         lines.append(
             {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
-            | {"training (s)": middle(alone(plain), "training s", ".0f")}
+            | {"training (s)": timed(alone(plain))}
             | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
             | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
         )
     return lines
+
+
+def timed(rows: list[dict[str, str]]) -> str:
+    """Seconds of the seeds that had a GPU for themselves, and their success."""
+    return f"{middle(rows, 'training s', '.0f')} ({middle(rows, 'success', '.0%')})" if rows else ""
 
 
 def many(rows: list[dict[str, str]]) -> list[Row]:
@@ -173,7 +178,7 @@ def main(args: Args) -> None:
     key = (*ABOUT[:-1], "clip", "file", "friction", "push")
     if args.race:
         rows = measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
-        args.publish("ablation", markdown(race(rows, shared=True)), PAGE)
+        print(markdown(race(rows, shared=True)))
         return
     rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
     args.publish("many", markdown(many(rows)), PAGE)

@@ -75,7 +75,7 @@ def make(
             with a task of your own ("my_task.py" or "my_task.py:Class"), or its class.
         num_envs: number of environments N.
         device: "cpu" or a CUDA device.
-        seed: of the random start states, commands and noise; by default another one for each environment that is made.
+        seed: of the random start states, commands and noise; by default, each call of `make` draws a new one.
         horizon: largest number of differentiable steps between two calls of DiffEnv.detach.
         contact: "soft" (penalty law) or "mujoco" (MuJoCo's constraints). Default: the task's, "mujoco" for go1, go2,
             g1, g1_track and tasks of your own, "soft" for the others.

@@ -48,7 +48,7 @@ class DiffEnv(VectorEnv):
 
     Actions are clipped to [-1, 1]. A step that ends an episode returns the first observation of the next one
     (gymnasium's SAME_STEP autoreset); the last one of the old episode is info["final_obs"]. No gradient crosses a
-    reset. Up to `horizon` differentiable steps make a window, which `detach` ends; under torch.no_grad there is no
+    reset. Up to `horizon` differentiable steps make a rollout, which `detach` ends; under torch.no_grad there is no
     limit.
 
     Args:
@@ -123,7 +123,7 @@ class DiffEnv(VectorEnv):
         self.qpos, self.qvel, self._obs, self.memory = self._draw_starts(1)[0]
         self._pinned: State | None = None
         self._disturb = self.task.disturb
-        # Start states of the whole window: one batch of operations, not one per step
+        # Start states of the whole rollout: one batch of operations, not one per step
         self._starts, self._time = self._draw_starts(horizon), 0
 
     @property
@@ -133,7 +133,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Restart all episodes and begin a window; returns obs (N, obs_dim) and an empty info.
+        """Restart all episodes and begin a rollout; returns obs (N, obs_dim) and an empty info.
 
         Raises:
             ValueError: several seeds (one generator draws all start states); options.
@@ -262,7 +262,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def detach(self) -> Tensor:
-        """Cut the graph at the current state, begin a window there, and return observations (N, obs_dim)."""
+        """Cut the graph at the current state, begin a rollout there, and return observations (N, obs_dim)."""
         self._detach_state()
         self._starts, self._time = self._draw_starts(self.horizon), 0
         return self._obs.clone()
@@ -272,13 +272,13 @@ class DiffEnv(VectorEnv):
         self.sim.rewind()
 
     def pin_window(self) -> State:
-        """Copy the state into fixed buffers, from which a CUDA graph replays the window; see graph.py."""
+        """Copy the state into fixed buffers, from which a CUDA graph replays the rollout; see graph.py."""
         self._set_state(part.detach().clone() for part in self._state())
         self._pinned = self._state()
         return self._pinned
 
     def write_back(self, pinned: State) -> None:
-        """End a captured window: write the state back into the buffers that `pin_window` returned."""
+        """End a captured rollout: write the state back into the buffers that `pin_window` returned."""
         with torch.no_grad():
             for to, value in zip(pinned, self._state(), strict=True):
                 to.copy_(value)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import draw
 import numpy as np
 import pytest
-from learners import ROOT
 from PIL import Image, ImageSequence
 
 from diffsim.extra.robots.joystick import Go2
@@ -54,16 +52,6 @@ def test_webp_plays_at_true_speed_for_ever(tmp_path: Path) -> None:
     assert len(shown) == 30 and sum(shown) == 1000
 
 
-def test_bars_are_of_the_numbers_in_the_pages() -> None:
-    shown = {(bar.task, bar.learner): bar.returns for bar in draw.measured_bars()["MuJoCo's contact"]}
-    text = (ROOT / "docs" / "transfer.md").read_text()
-    rows = re.findall(r"^\| (\w+), (\w+) \| (\d+), (\d+), (\d+) \|", text, re.MULTILINE)
-    assert {row[:2] for row in rows} == {("humanoid", "sapo")}
-    for task, learner, *seeds in rows:
-        low, middle, high = sorted(map(int, seeds))
-        assert [round(value) for value in shown[task, learner]] == [middle, low, high]
-
-
 @pytest.mark.slow
 def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one with a clock, both worlds above diagrams, and of one without, alone; a clip."""
@@ -77,4 +65,7 @@ def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert both.size == (2 * 96, 64 + 12 + 4 * draw.ROW) and one.size == (96, 64)
         cycles = both.n_frames * Go2.control_dt * Go2.robot.cycle  # type: ignore[attr-defined]
         assert cycles == pytest.approx(round(cycles), abs=Go2.robot.cycle * Go2.control_dt)
-        assert 1.4 * 30 <= one.n_frames <= 2.4 * 30  # type: ignore[attr-defined]
+        assert 4.0 * 30 <= one.n_frames <= 5.0 * 30  # type: ignore[attr-defined]
+    draw.batch(POLICIES / "go2.pt", count=4, seconds=0.2, size=(96, 64))
+    with Image.open(tmp_path / "go2_batch.webp") as many:
+        assert many.size == (96, 64) and many.n_frames == 5  # type: ignore[attr-defined]

@@ -63,6 +63,20 @@ def test_learned_controller() -> None:
     assert np.mean(distances[-5:]) < 0.3 * np.mean(distances[:5])
 
 
+def test_own_learner() -> None:
+    """The page shows the loop of the file; the pole swings up."""
+    page, file = (ROOT / "docs" / "own_learner.md").read_text(), (EXAMPLES / "own_learner.py").read_text()
+    listing, critic = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert listing in file and len(page.split()) <= 500
+    returns = load("own_learner").train()
+    assert np.mean(returns[:3]) < -1500 and np.mean(returns[-3:]) > -800
+    env = diffsim.make("hopper", 4, horizon=8)
+    env.reset(seed=1)
+    policy, value = (torch.nn.Linear(11, width) for width in (3, 1))
+    exec(critic, {"torch": torch, "env": env, "policy": policy, "critic": value})
+    assert all(part.grad.norm() > 0 for part in policy.parameters())
+
+
 @pytest.mark.parametrize("truth", [{"mu": 0.7, "mass": 1.2}, {"mu": 0.5, "mass": 0.85}])
 def test_system_identification(truth: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a robot that MuJoCo simulates, at its own time step."""

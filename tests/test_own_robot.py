@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +18,8 @@ import ppo_baseline
 import shac
 import view
 from diffsim.extra.commands import main as diffsim_main
-from diffsim.training import checkpoint, parse
+from diffsim.tasks.base import ASSETS
+from diffsim.training import checkpoint, load_policy, parse
 
 PAGE = (ROOT / "docs" / "own_robot.md").read_text()
 LISTING, SNIPPET = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -49,14 +51,16 @@ def small(words: Sequence[str], run: Path | None = None, iterations: int = 2) ->
 
 
 def test_the_page_is_short_and_lists_the_example() -> None:
-    assert len(PAGE.split()) <= 500 and LISTING in (ROOT / "examples" / "own_robot.py").read_text()
+    assert len(PAGE.split()) <= 750 and LISTING in (ROOT / "examples" / "own_robot.py").read_text()
     assert LISTING.count("\n") <= 30 and "class RunForward(Task):" in LISTING
+    first = "-m", "ppo_baseline.py", "view.py", "ppo_baseline.py", "ppo_baseline.py"
     assert [words[0] for words in COMMANDS] == [
+        *first,
+        "clone",
+        "shac.py",
+        "install",
         "-m",
-        "ppo_baseline.py",
-        "view.py",
-        "ppo_baseline.py",
-        "ppo_baseline.py",
+        "examples/own_quadruped.py",
     ]
 
 
@@ -68,7 +72,7 @@ def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     saved = checkpoint.load(run / "checkpoint.pt")
     assert saved["args"]["env"] == "examples/own_robot.py" and saved["iteration"] == 2
     assert saved["args"]["contact"] == "mujoco"
-    check, _, watch, judge, resume = COMMANDS
+    check, _, watch, judge, resume = COMMANDS[:5]
     diffsim_main(check[2:])
     assert "own_robot: can be simulated" in capsys.readouterr().out
     view.main(small(watch, run))
@@ -125,3 +129,24 @@ def test_flags_of_an_own_task(home: Path) -> None:
     assert (args.contact, args.substeps, args.horizon) == ("soft", 16, 32)
     args = parse(shac.Args, ["--env", "hopper"])
     assert (args.contact, args.implicit) == ("soft", False)
+
+
+def test_a_robot_of_menagerie_and_its_onnx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In MuJoCo, with its time step, the exported policy moves the robot as it does here."""
+    pytest.importorskip("onnxruntime")
+    (folder := tmp_path / "mujoco_menagerie" / "unitree_a1").mkdir(parents=True)
+    shutil.copy(ASSETS / "go2.xml", folder / "scene.xml")  # has the A1's joints, too
+    shutil.copy(ASSETS / "stage.xml", folder)
+    monkeypatch.chdir(tmp_path)
+    file = str(ROOT / "examples" / "own_quadruped.py")
+    _, train, _, export, play = COMMANDS[5:]
+    assert train[2] == export[-1] == f"{Path(file).parent.name}/{Path(file).name}" == play[0]
+    tiny = "--iterations 1 --num-envs 4 --horizon 4 --run-dir run".split()
+    shac.main(["--env", file, *tiny, *FEW])
+    diffsim_main(["export", "run/checkpoint.pt", "a1.onnx", "--env", file])
+    env = diffsim.make(file, 1, substeps=10, stochastic_init=False)
+    policy, (obs, _) = load_policy("run/checkpoint.pt").network, env.reset()
+    with torch.no_grad():
+        for _ in range(15):
+            obs, *_ = env.step(policy(obs))
+    assert sys.modules[type(env.task).__module__].play("a1.onnx", 0.3) == pytest.approx(env.qpos[0, 0].item(), abs=1e-3)

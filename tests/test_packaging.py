@@ -77,6 +77,17 @@ def test_the_source_distribution_holds_the_repository(repository: list[str], sou
     assert files - {"PKG-INFO"} == {*repository}
 
 
+def test_one_placeholder_stands_for_the_repository() -> None:
+    """The owner replaces OWNER/diffsim once; what names a version names today's."""
+    files = "pyproject.toml", "CITATION.cff", "README.md", "examples/first_steps.ipynb"
+    texts = {name: (ROOT / name).read_text() for name in files}
+    (owner,) = {match for text in texts.values() for match in re.findall(r"github\.com/([\w-]+/diffsim)\b", text)}
+    assert all(f"github.com/{owner}" in text for text in texts.values())
+    version = diffsim.__version__
+    assert f"version: {version}\n" in texts["CITATION.cff"] and f"version = {{{version}}}" in texts["README.md"]
+    assert f"/v{version}/diffsim_rl-{version}-py3-none-any.whl" in texts["examples/first_steps.ipynb"]
+
+
 def test_an_editable_install_is_found_from_every_folder(source: Path, tmp_path: Path) -> None:
     """From the clone's parent, too, where the clone's own folder has the name of the package."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path)], check=True)

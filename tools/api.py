@@ -12,10 +12,11 @@ import diffsim
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 HEAD = """# API
 
-`python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. `SceneError`
+`python tools/api.py` writes this page from docstrings. N is the number of environments. `SceneError`
 and `TaskError` are `ValueError`s.
 """
 NAMES = "make DiffEnv Simulator Integration Task load_scene".split()
+FULL = "step reset detach set_state jacobians".split()  # methods of DiffEnv and Simulator, printed with all they say
 # Methods that few programs need
 INTERNAL = """pin_window write_back take_statistics advance check_tensor tangent check load_robot scene bind presets
 integration falls has_mirror configured terrain stored restored over ghost disturb observe_with""".split()
@@ -34,13 +35,18 @@ def signature(thing: object) -> str:
 
 
 def members(kind: type) -> Iterator[str]:
-    """A row for each public method that the class documents: its first sentence."""
+    """A row for each other public method that the class documents: its first sentence."""
     for name, each in vars(kind).items():
         doc = each.__doc__ if inspect.isfunction(each) else None
-        if doc and not name.startswith("_") and name not in INTERNAL:
+        if doc and not name.startswith("_") and name not in INTERNAL and name not in full(kind):
             call = re.sub(r"\s+", " ", f"({signature(each)})")
             first = re.split(r"(?<=[.;]) |(?<=[\w)]): ", " ".join(doc.split()))[0]
             yield f"| `{name}{call}` | {first.rstrip(';')} |"
+
+
+def full(kind: type) -> list[str]:
+    """The names of the class's methods that the page prints with all that they say."""
+    return [name for name in FULL if name in vars(kind)] if kind is not diffsim.Task else []
 
 
 def page() -> str:
@@ -50,8 +56,11 @@ def page() -> str:
         thing, kind = getattr(diffsim, name), isinstance(getattr(diffsim, name), type)
         doc = re.sub(r"\n\nExample:\n.*?(?=\n\n\w)", "", inspect.getdoc(thing) or "", flags=re.DOTALL)
         doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
-        call = "" if isinstance(thing, type) and name != "Integration" else f"({signature(thing)})"
+        call = f"({signature(thing)})" if name in ("Integration", "load_scene") else ""
         parts.append(f"## {name}\n\n```python\ndiffsim.{name}{call}\n```\n\n```text\n{doc}\n```\n")
+        for method in full(thing) if isinstance(thing, type) else ():
+            each = getattr(thing, method)
+            parts.append(f"### {name}.{method}({signature(each)})\n\n```text\n{inspect.getdoc(each)}\n```\n")
         if kind and (rows := [*members(thing)]):
             parts.append("\n".join(["| member | meaning |", "|---|---|", *rows]) + "\n")
     return "\n".join(parts)

@@ -3,27 +3,24 @@
     python tools/draw.py films                                # of all policies in diffsim/policies
     python tools/draw.py films diffsim/policies/go2.pt
     python tools/draw.py gait runs/<run>/checkpoint.pt --start 2 --every 0.1 --frames 8
-    python tools/draw.py overview
-    python tools/draw.py bars
+    python tools/draw.py batch diffsim/policies/go2.pt
 
 A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own contact on the file of the robot, from
 the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
 that it plays in a loop; a robot that falls or does not travel is shown from its start. Robots that follow commands go
-forward, above a diagram of the time in which each foot is on the ground (Hildebrand 1965). Muscles, which are not
-simulated in MuJoCo, are coloured by activation, as in the SHAC paper's Figure 5. What a robot tracks is drawn as a
-ghost. The gait is that of the first of a few
-random episodes that lasts long enough.
+forward, along an arrow, above a diagram of the time in which each foot is on the ground (Hildebrand 1965). Muscles,
+which are not simulated in MuJoCo, are coloured by activation, as in the SHAC paper's Figure 5. What a robot tracks is
+drawn as a ghost. The gait is that of the first of a few random episodes that lasts long enough.
 """
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 import torch
 import tyro
@@ -31,10 +28,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from tyro.conf import Positional
 
-from diffsim import TASKS, Scene
+from diffsim import Scene
 from diffsim.extra.commands import DEMO_EPISODES, POLICIES
 from diffsim.extra.gait import TOUCHING, contact_bodies, trace
-from diffsim.extra.render import Frame, Renderer, whole_file
+from diffsim.extra.render import Frame, Renderer, drawable, whole_file
 from diffsim.extra.robots.imitation.tracking import Tracking
 from diffsim.extra.robots.joystick import Joystick
 from diffsim.extra.watch import make_policy_env
@@ -54,12 +51,13 @@ CLOSER = {
     "humanoid": (1.6, 0.56),
     "humanoid_mtu": (1.2, 0.52),
     "go2": (1.3, 0.55),
-    "g1": (1.4, 0.51),
+    "g1": (1.3, 0.49),
     "g1_track": (1.25, 0.49),
 }
-FLOOR, AROUND = 2.0, 2.8  # m after which the floor repeats; s that a robot with a clock takes for it, in whole cycles
+FLOOR, AROUND = 4.0, 4.8  # m after which the floor repeats; s that a robot with a clock takes for it, in whole cycles
 DANCE = 12.6, 5.0  # s of the clip that a film of tracking begins with, and how many it shows
-LEAST_FPS, QUALITY = 30.0, 45  # of a film; WebP's, of 100
+LEAST_FPS, QUALITY = 25.0, 40  # of a film; WebP's, of 100
+SPACING = 1.5  # m between the robots of a batch
 ROW, LABELS = 16, 56  # pixels of a foot's line in the diagram, and of its name
 INK, PAPER, PALE = (40, 46, 58), (255, 255, 255), (226, 230, 236)
 
@@ -81,7 +79,7 @@ def films(
     checkpoints: Positional[tuple[Path, ...]] = (),
     size: tuple[int, int] = (480, 320),
     start: float = 2.0,
-    seconds: tuple[float, float] = (1.4, 2.4),
+    seconds: tuple[float, float] = (4.0, 5.0),
     beside: bool = True,
 ) -> None:
     """A film of each policy, called as its task.
@@ -90,7 +88,7 @@ def films(
         checkpoints: files of any script. Default: the shipped policies.
         size: width and height of a world's picture in pixels.
         start: seconds into the episode before which no loop begins.
-        seconds: shortest and longest loop, unless the robot has a clock; what is shown from its start takes 3.5 s.
+        seconds: shortest and longest loop, unless the robot has a clock; what is shown from its start takes 4 s.
         beside: show MuJoCo, too; without it the file is called <task>_here.webp.
     """
     for checkpoint in checkpoints or [POLICIES / f"{task}.pt" for task in CLOSER]:
@@ -100,14 +98,14 @@ def films(
         fps, clock = 1 / (every * dt), isinstance(task, Joystick)
         shortest, longest = (stride(task), stride(task)) if isinstance(task, Joystick) else seconds
         if tracks:  # of the clip, from its beginning on
-            case.env.stochastic_init, every, fps = False, 2 * every, fps / 2
+            case.env.stochastic_init = False
             start, longest = DANCE
         sides = motions(case, round((start + longest + 2.0) / dt), every, beside)
         if tracks:
             sides = {name: motion.part(round(start * fps), round(longest * fps)) for name, motion in sides.items()}
             pictures = {name: drawn(case, motion, size) for name, motion in sides.items()}
         elif any(motion.fallen for motion in sides.values()) or not (clock or task.forward_column is not None):
-            sides = {name: motion.part(0, round(3.5 * fps)) for name, motion in sides.items()}
+            sides = {name: motion.part(0, round(4.0 * fps)) for name, motion in sides.items()}
             pictures = {name: drawn(case, motion, size) for name, motion in sides.items()}
         else:
             sides = {name: motion.part(round(start * fps)) for name, motion in sides.items()}
@@ -135,7 +133,8 @@ def drawn(case: Case, motion: Motion, size: tuple[int, int]) -> list[Frame]:
     with Renderer(case.env.scene, wide, high) as renderer:
         ghosts = [None] * len(motion.qpos) if motion.ghost is None else motion.ghost
         rows = zip(motion.qpos, motion.action, ghosts, strict=True)
-        whole = (renderer.draw(qpos, action, ghost=ghost) for qpos, action, ghost in rows)
+        speed = FLOOR / stride(case.env.task) if isinstance(case.env.task, Joystick) else 0.0  # forward, the command
+        whole = (renderer.draw(qpos, action, ghost=ghost, arrow=speed) for qpos, action, ghost in rows)
         return [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in whole]
 
 
@@ -243,111 +242,46 @@ def gait(
     print(path)
 
 
-def overview() -> None:
-    """The figure of the README: what a control step computes, and how gradients come back."""
-    from matplotlib.figure import Figure
-    from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+def batch(
+    checkpoint: Positional[Path], count: int = 36, seconds: float = 4.0, size: tuple[int, int] = (640, 360)
+) -> None:
+    """A film of many environments of one batch, each at its place of a grid, called <task>_batch.webp.
 
-    boxes = {
-        "policy": "torch\nnn.Module",
-        "simulator": "substeps in\nWarp kernels,\nown adjoint",
-        "task": "observation,\nreward, end\n(torch)",
-        "loss": "sum of rewards\nof a rollout\n(+ value)",
-    }
-    figure = Figure(figsize=(8, 2.5), dpi=200)
-    axes = figure.subplots()
-    axes.set(xlim=(0, 16), ylim=(1, 5.2), aspect="equal")
-    axes.axis("off")
-    for k, (name, text) in enumerate(boxes.items()):
-        left = 0.2 + 4.25 * k
-        axes.add_patch(FancyBboxPatch((left, 1.3), 2.6, 2.4, "round,pad=0.1", fc="#e2e6ec", ec="#282e3a"))
-        axes.text(left + 1.3, 3.3, name, ha="center", va="center", weight="bold", fontsize=11)
-        axes.text(left + 1.3, 2.2, text, ha="center", va="center", fontsize=9)
-    for k, forward in enumerate(("action", "state", "reward")):
-        begin, end = 2.9 + 4.25 * k, 4.35 + 4.25 * k
-        for y, ends, colour in ((2.9, (begin, end), "#282e3a"), (2.0, (end, begin), "#d63c28")):
-            axes.add_patch(
-                FancyArrowPatch((ends[0], y), (ends[1], y), arrowstyle="-|>", mutation_scale=14, color=colour)
-            )
-        middle = (begin + end) / 2
-        axes.text(middle, 3.15, forward, ha="center", va="bottom", fontsize=9)
-        axes.text(middle, 1.8, "gradient", ha="center", va="top", fontsize=8, color="#d63c28")
-    style: Any = dict(arrowstyle="-|>", mutation_scale=14, connectionstyle="arc3,rad=0.22", color="#282e3a")
-    axes.add_patch(FancyArrowPatch((10.0, 3.85), (1.5, 3.85), **style))
-    axes.text(5.75, 4.95, "observation of the next step", ha="center", va="center", fontsize=9)
-    figure.savefig(FIGURES / "overview.png", bbox_inches="tight", pad_inches=0.05)
-    print(FIGURES / "overview.png")
-
-
-class Bar(NamedTuple):
-    """A learner on a task: median, lowest and highest return, and seconds of training, in all (0: not measured)."""
-
-    learner: str
-    task: str
-    returns: list[float]
-    training: float = 0.0
-    total: float = 0.0
-
-
-def measured_bars() -> dict[str, list[Bar]]:
-    """Those of one H200, by contact. Trainings in mujoco_warp ended after the same time."""
-    import paper
-    from tables import grouped, read_csv
-
-    names, folder = {"ppo_4096": "ppo", "sac_large": "sac, large batch"}, paper.ROOT / "results" / "h200"
-    args = paper.Args(output=folder.with_name("cpu"))
-    penalty: dict[tuple[str, str], Bar] = {}
-    for line in (line for group in ("headline", "large_batch") for line in paper.table(args, group)):
-        learner, task, seconds, total = (str(line[key]) for key in ("learner", "task", "training (s)", "in all (s)"))
-        values = [float(x) for x in re.findall(r"-?\d+", str(line["return"]))]
-        if task != "cartpole":  # whose return is < 0
-            penalty[learner, task] = Bar(names.get(learner, learner), task, values, float(seconds), float(total or 0))
-    exact = []
-    for row in read_csv(folder / "learning.csv"):
-        seeds = [float(x) for x in row["each seed"].split()]
-        values = [float(row["return"]), min(seeds), max(seeds)]
-        exact.append(Bar(row["learner"].removesuffix("_mujoco"), row["task"], values, float(row["training (s)"])))
-    for (cell,), rows in grouped(read_csv(folder / "contact.csv"), "cell").items():
-        task, learner = cell.split(", ")
-        ends = [float(row["return"]) for row in rows]
-        exact.append(Bar(learner, task, [median(ends), min(ends), max(ends)]))
-    for (task,), rows in grouped(read_csv(folder / "peer_train.csv"), "task").items():
-        ends, times = ([float(row[key]) for row in rows] for key in ("return", "training (s)"))
-        values = [median(ends), min(ends), max(ends)]
-        exact.append(Bar("ppo in mujoco_warp", task, values, median(times)))
-    return {"penalty contact": [*penalty.values()], "MuJoCo's contact": exact}
-
-
-def bars() -> None:
-    """Return and seconds of learners, as in the tables of docs/experiments.md and docs/transfer.md."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5.2), dpi=200)
-    panels, colours = figure.subplots(2, 2), dict[str, str]()
-    for (first, second), (contact, found) in zip(panels, measured_bars().items(), strict=True):
-        learners, tasks = (list(dict.fromkeys(getattr(bar, key) for bar in found)) for key in ("learner", "task"))
-        learners.sort(key=[*colours, *learners].index)  # in each panel in the same order
-        tasks.sort(key=list(TASKS).index)
-        for k, learner in enumerate(learners):
-            colour = colours.setdefault(learner, f"C{len(colours)}")
-            own = [bar for bar in found if bar.learner == learner]
-            at = np.array([tasks.index(bar.task) + 0.2 * (k - (len(learners) - 1) / 2) for bar in own])
-            middle, low, high = np.array([bar.returns for bar in own]).T
-            first.bar(at, middle, 0.18, yerr=(middle - low, high - middle), capsize=2, color=colour, label=learner)
-            second.bar(at, [max(bar.total, bar.training) for bar in own], 0.18, color=colour, alpha=0.4)
-            second.bar(at, [bar.training for bar in own], 0.18, color=colour, label=learner)
-        labels = "return, median and range", "seconds of training; light:\ntotal, some on an H100"
-        for panel, text in zip((first, second), labels, strict=True):
-            panel.set_ylabel(text, fontsize=9)
-            panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8, va="top")
-            panel.tick_params(axis="y", labelsize=9)
-            panel.spines[["top", "right"]].set_visible(False)
-        first.set_title(contact, fontsize=10, loc="left")
-    shown = {label: bar for row in panels for bar, label in zip(*row[1].get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown, loc="lower center", ncols=len(shown), fontsize=9, frameon=False)
-    figure.tight_layout(rect=(0, 0.05, 1, 1))
-    figure.savefig(FIGURES / "h200" / "bars.png")
-    print(FIGURES / "h200" / "bars.png")
+    Args:
+        checkpoint: file of any script.
+        count: robots, a square number.
+        seconds: length, from one second into the episode on.
+        size: width and height in pixels.
+    """
+    saved = load_policy(checkpoint)
+    episodes = evaluate(make_policy_env(saved, count), saved.network)
+    dt, side = episodes.control_dt, round(count**0.5)
+    every = max(1, int(1 / (LEAST_FPS * dt) + 1e-6))
+    rows = np.stack(
+        [episodes.episode(k)[0][round(1 / dt) :: every][: round(seconds / dt / every)] for k in range(count)]
+    )
+    model, _ = drawable(episodes.scene)
+    model.vis.global_.offwidth, model.vis.global_.offheight = size
+    model.vis.map.shadowclip *= side  # the light sees all of them
+    data, option, pert, camera = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
+    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.95 * side * SPACING
+    spread = SPACING * (np.arange(side) - (side - 1) / 2)
+    places = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2)
+    rows[:, :, :2] += places[:, None] - rows[:, :1, :2]  # each starts at its place
+    frames = []
+    with mujoco.Renderer(model, size[1], size[0], max_geom=model.ngeom * count + 100) as renderer:
+        for moment in rows.swapaxes(0, 1):
+            for k, data.qpos[:] in enumerate(moment):
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_camlight(model, data)
+                if k == 0:
+                    renderer.update_scene(data, camera)
+                else:
+                    kind = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+                    mujoco.mjv_addGeoms(model, data, option, pert, kind, renderer.scene)
+            frames.append(renderer.render())
+    path = save_webp(FIGURES / f"{saved.args['env'].partition(':')[0]}_batch.webp", frames, 1 / (every * dt))
+    print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
 
 
 def halve(frame: Frame) -> Frame:
@@ -359,9 +293,7 @@ def halve(frame: Frame) -> Frame:
 @command
 def main() -> None:
     torch.set_num_threads(1)
-    tyro.extras.subcommand_cli_from_dict(
-        {"films": films, "gait": gait, "overview": overview, "bars": bars}, description=__doc__
-    )
+    tyro.extras.subcommand_cli_from_dict({"films": films, "gait": gait, "batch": batch}, description=__doc__)
 
 
 if __name__ == "__main__":

@@ -19,12 +19,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Array, Scene
+from diffsim.tasks.base import ASSETS
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
 
 AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.1, 1.0])  # colours of a muscle
+LOOKS = ASSETS / "looks"  # meshes that are drawn in place of a robot's primitives; tools/looks.py writes them
 GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
 GHOST = np.array([0.2, 0.6, 0.3, 0.35], dtype=np.float32)
+ARROW = np.array([0.84, 0.24, 0.16, 1.0], dtype=np.float32)
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
@@ -64,7 +67,12 @@ class Renderer(AbstractContextManager["Renderer"]):
             self._camera = camera
 
     def draw(
-        self, qpos: ArrayLike, ctrl: ArrayLike | None = None, profile: int = 0, ghost: ArrayLike | None = None
+        self,
+        qpos: ArrayLike,
+        ctrl: ArrayLike | None = None,
+        profile: int = 0,
+        ghost: ArrayLike | None = None,
+        arrow: float = 0.0,
     ) -> Frame:
         """The frame (height, width, 3) of one configuration qpos (nq,).
 
@@ -72,6 +80,7 @@ class Renderer(AbstractContextManager["Renderer"]):
             ctrl: (nu,) in [-1, 1]; colours muscles by their activation, blue at rest, red at full force.
             profile: of which environment's terrain, if each has its own.
             ghost: another configuration (nq,) of the robot, which is drawn transparent.
+            arrow: velocity [m/s] along x, shown by an arrow in front of the robot; 0: none.
         """
         self._data.qpos[:] = qpos
         if ctrl is not None:
@@ -83,6 +92,8 @@ class Renderer(AbstractContextManager["Renderer"]):
         self._renderer.update_scene(self._data, self._camera)
         if self._terrain is not None:
             add_terrain(self._renderer.scene, self._terrain[profile % len(self._terrain)], self._material)
+        if arrow:
+            point(self._renderer.scene, self._data.xpos[1] + (0.25, 0.0, 0.2), arrow)
         if ghost is not None:
             self._data.qpos[:] = ghost
             mujoco.mj_kinematics(self.model, self._data)
@@ -106,14 +117,56 @@ def drawable(scene: Scene) -> tuple[mujoco.MjModel, int]:
 
     It has light everywhere: without a sun, a file's lamp leaves dark what walks away from it.
     """
-    model = copy.copy(scene.mj_model)
+    model = dressed(scene) or copy.copy(scene.mj_model)
     if (model.light_type != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL).all():
         model.vis.headlight.ambient, model.vis.headlight.diffuse = 0.5, 0.5
     planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    model.geom_rgba[planes[model.geom_matid[planes] >= 0]] = 1.0  # a robot's default colour does not tint the floor
     material = int(model.geom_matid[planes[0]]) if len(planes) else -1
     if scene.terrain is not None:
         model.geom_matid[planes], model.geom_rgba[planes] = -1, 0.0
     return model, material
+
+
+def dressed(scene: Scene) -> mujoco.MjModel | None:
+    """A model of the same bodies and joints with the robot's looks and our floor and sky, or None if it needs neither.
+
+    A file with a skybox or a textured floor keeps its own.
+    """
+    path = Path(scene.path)
+    looks = LOOKS / f"{path.stem}.npz"
+    worn = looks.is_file() and (path.parent == ASSETS or not path.is_file())  # or a task's change of that robot
+    path = ASSETS / f"{path.stem}.xml" if worn else path
+    bare = not scene.mj_model.ntex and (scene.mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any()
+    if not worn and not (bare and path.is_file()):
+        return None
+    spec = mujoco.MjSpec.from_file(str(path))
+    if worn:
+        wear(spec, np.load(looks))
+    else:
+        stage = mujoco.MjSpec.from_file(str(ASSETS / "stage.xml"))
+        for texture in stage.textures:
+            how = {name: getattr(texture, name) for name in ("type", "builtin", "rgb1", "rgb2", "width", "height")}
+            spec.add_texture(name=f"stage {texture.name}", **how)
+        floor = spec.add_material(name="stage floor", texrepeat=[0.5, 0.5], texuniform=True)
+        floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "stage checker"
+        for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+            geom.material = floor.name
+    model = spec.compile()
+    return model if (model.nq, model.nbody) == (scene.mj_model.nq, scene.mj_model.nbody) else None
+
+
+def wear(spec: mujoco.MjSpec, parts: Any) -> None:
+    """Give bodies the meshes of a file of LOOKS in place of their geoms: "<body> <r> <g> <b> <a>", then v or f."""
+    labels = sorted({label[:-2] for label in parts})
+    for geom in [geom for geom in spec.geoms if geom.parent.name in {label.split()[0] for label in labels}]:
+        spec.delete(geom)
+    for label in labels:
+        body, *rgba = label.split()
+        corners = {"uservert": parts[f"{label} v"].astype(float).ravel(), "userface": parts[f"{label} f"].ravel()}
+        spec.add_mesh(name=label, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL, **corners)
+        how: Any = dict(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=label, contype=0, conaffinity=0, mass=0)
+        spec.body(body).add_geom(**how, rgba=[float(x) for x in rgba])
 
 
 def slabs(profile: Array) -> Iterator[tuple[Array, Array, Array]]:
@@ -138,6 +191,14 @@ def add_terrain(scene: mujoco.MjvScene, profile: Array, material: int) -> None:
         mujoco.mjv_initGeom(box, mujoco.mjtGeom.mjGEOM_BOX, size, centre, rotation.ravel(), GROUND)
         box.matid = material
         scene.ngeom += 1
+
+
+def point(scene: mujoco.MjvScene, place: Array, velocity: float) -> None:
+    """Add an arrow along x at a place (3,), 0.4 m long for 1 m/s."""
+    geom, end = scene.geoms[scene.ngeom], place + (0.4 * velocity, 0.0, 0.0)
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.eye(3).ravel(), ARROW)
+    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.02, place, end)
+    scene.ngeom += 1
 
 
 def activations(model: mujoco.MjModel, ctrl: ArrayLike) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

@@ -13,11 +13,10 @@ from learners import refusal
 
 from diffsim.training.checkpoint import POLICIES
 
-MADE = "gradients", "joystick", "numerics", "suites", "tracking", "transfer", "gps_controllers"
+MADE = "gradients", "joystick", "numerics", "overview", "suites", "tracking", "transfer", "gps_controllers"
 CASES = [
     *((name, {}) for name in MADE),
     *((name, {"race": True}) for name in ("joystick", "tracking")),
-    ("numerics", {"parts": ("promise",)}),
     ("speed", {"parts": ("iteration",), "output": common.RESULTS / "h100"}),
 ]
 

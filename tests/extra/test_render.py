@@ -159,3 +159,24 @@ def test_an_mp4_asked_for_is_written_or_refused(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(OSError, match="cannot write .*b.mp4"):
         save_video(tmp_path / "b.mp4", grey(1), 30)
     assert [path.name for path in tmp_path.iterdir()] == ["folder.mp4"]
+
+
+@pytest.mark.parametrize("name", ["go1", "go2", "g1"])
+def test_robots_of_unitree_wear_meshes_that_are_not_simulated(name: str) -> None:
+    scene = load_scene(ASSETS / f"{name}.xml")
+    model = render.dressed(scene)
+    assert model and model.nmesh > 10 and not scene.mj_model.nmesh
+    assert (render.LOOKS / f"{name}.npz").stat().st_size < 400_000
+    for field in ("jnt_type", "jnt_pos", "jnt_axis", "body_pos", "body_quat", "body_mass", "actuator_ctrlrange"):
+        np.testing.assert_array_equal(getattr(model, field), getattr(scene.mj_model, field), field)
+
+
+def test_a_plain_file_gets_our_floor_and_sky(tmp_path: Path) -> None:
+    """One with textures keeps its own."""
+    body = '<body pos="0 0 1"><freejoint/><geom size=".1"/></body>'
+    (tmp_path / "plain.xml").write_text(
+        f'<mujoco><worldbody><geom type="plane" size="0 0 1"/>{body}</worldbody></mujoco>'
+    )
+    model = render.dressed(scene := load_scene(tmp_path / "plain.xml"))
+    assert model and model.ntex == 2 and model.geom_matid[0] == 0 and not scene.mj_model.ntex
+    assert render.dressed(load_scene(ASSETS / "ant.xml")) is None

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.extra.render import GHOST, activations, orbit
+from diffsim.extra.render import GHOST, activations, dressed, orbit
 from diffsim.robot.scene import Scene
 
 HIDDEN_GROUP = 3  # geoms from this group on are not drawn, as in MuJoCo
@@ -34,7 +34,7 @@ def describe(scene: Scene, control_dt: float, ghost: bool = False) -> dict[str, 
     control_dt [s] lies between two pictures. A ghost is a second, transparent robot. Terrain is that of the first
     environment.
     """
-    model = scene.mj_model
+    model = dressed(scene) or scene.mj_model
     planes, painted = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, model.geom_matid >= 0
     rgba = model.geom_rgba.copy()
     rgba[painted] = model.mat_rgba[model.geom_matid[painted]]

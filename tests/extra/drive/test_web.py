@@ -109,7 +109,7 @@ def test_a_ghost_has_bodies_of_its_own() -> None:
 
 
 def scene_of(model: mujoco.MjModel, *profiles: np.ndarray) -> Any:
-    return SimpleNamespace(mj_model=model, terrain=profiles or None)
+    return SimpleNamespace(mj_model=model, terrain=profiles or None, path="")
 
 
 def test_meshes_lie_where_the_file_has_them():
