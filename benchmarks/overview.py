@@ -25,7 +25,7 @@ GPUS = "h200", "h100"  # of a learner with results on both the first one counts
 # Ablations of a learner have their pages. Each learner keeps its colour.
 SHOWN = "rpo shac sapo ppo_4096 ppo_baseline bptt sac_baseline sac_large redq redq_500 mbpo se_mbpo".split()
 COLUMNS = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")
-MAIN = {"rpo": "RPO", "shac": "SHAC", "sapo": "SAPO", "ppo_4096": "PPO"}  # in the README
+MAIN = {"rpo": "RPO", "shac": "SHAC", "ppo_4096": "PPO"}  # in the README
 RACES = ("joystick_race", "error", "go2", "error (m/s)"), ("tracking_race", "success", "g1_track", "success")
 
 
