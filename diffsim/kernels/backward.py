@@ -29,6 +29,7 @@ from diffsim.kernels.lane import D_LIMIT, K_LIMIT, MOTOR, lane_of
 from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
+from diffsim.kernels.pairs import pair_rows
 from diffsim.kernels.solve import factor_solve
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -40,12 +41,13 @@ from diffsim.robot.scene import FACTORS
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
     T, vec2, vec3, vec6, quat, Model, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Lane
-    Link, Node, Adjoint, Base = t.Link, t.Node, t.Adjoint, t.Base
+    Link, Node, Adjoint, Base, Contact = t.Link, t.Node, t.Adjoint, t.Base, t.Contact
     Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.Ts
     lane, solve = lane_of(spec), factor_solve(spec)
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint = muscle_law(spec), constraint_law(spec)
+    PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
     CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
     CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT, BASE_DAMPED = spec.has("contact motor clamp muscle limit base_damping")
     LIMIT = LIMIT and not spec.constrained  # the penalty law
@@ -53,8 +55,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     read, write, pick = block.read, block.write, block.pick
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in spec.features
-    THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
+    THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.room
     # Local arrays have at least one element, also where they are not read.
+    CONTACTS = max(spec.spheres, 1) + spec.pairs
     NFACTORS, TENSIONS, BODIES = (len(FACTORS) if VARIED else 1), (NU if MUSCLE else 1), max(spec.forced, 1)
 
     @wp.func
@@ -404,6 +407,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         links = wp.zeros(shape=SLOTS, dtype=Link)
         nodes = wp.zeros(shape=SLOTS, dtype=Node)
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)
+        if wp.static(PAIRS):
+            contacts = wp.zeros(shape=CONTACTS, dtype=Contact)
         adj_factors = wp.zeros(shape=NFACTORS, dtype=T)
         adj_forces = wp.zeros(shape=BODIES, dtype=vec6)
         tension = wp.zeros(shape=TENSIONS, dtype=T)
@@ -432,8 +437,17 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             carrier = kin.place_links(m, here, links, carrier)
             recompute_joints(m, here, ck, links, nodes)
             # 2. to 4.
+            if wp.static(PAIRS):
+                origin = vec3()
+                if wp.static(FLOATING):
+                    origin = load_vec3(ck.q, here, 0)
+                here.listed = pairs.recall(m, here, links, origin, ck, contacts)
             solve(m, here, ck, links, nodes, base)
+            if wp.static(PAIRS):
+                pairs.correct_lambda(m, here, links, ck, contacts, nodes)
             partials(m, here, links, nodes, carrier, ck, adj, adj_factors)
+            if wp.static(PAIRS):
+                pairs.add_adjoint(m, here, links, contacts, nodes, adj)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):

@@ -21,6 +21,7 @@ from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.newton import newton_method
+from diffsim.kernels.pairs import pair_rows
 from diffsim.kernels.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import FAR, MAX_POSITION, MAX_SPEED, KernelSpec
@@ -39,15 +40,16 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, sweep, constraint, newton = muscle_law(spec), articulated(spec), constraint_law(spec), newton_method(spec)
+    PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
     CONTACT, MOTOR, CLAMP, MUSCLE = spec.has("contact motor clamp muscle")
     NU, FLOATING, FORCED = spec.nu, spec.floating, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     NBALL = spec.nball
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
-    THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.slots
+    THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.room
     # Local arrays have at least one element, also where they are not read.
-    SPHERES, BALLS, TENSIONS = max(spec.spheres, 1), max(NBALL, 1), NU if MUSCLE else 1
+    SPHERES, BALLS, TENSIONS = max(spec.spheres, 1) + spec.pairs, max(NBALL, 1), NU if MUSCLE else 1
 
     @wp.func
     def read_state(m: Model, here: Lane, batch: t.Batch, links: Links, ball_rot: Quats):
@@ -281,6 +283,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(CONTACT):
                     constraint.begin_contacts(m, here, links, carrier, contacts)
                 newton.initialize(m, here, links, motions, loads, free_loads, root)
+                if wp.static(PAIRS):
+                    here.listed = pairs.begin(m, here, links, motions, root.pos, contacts)
                 phase = int(NEWTON)
                 while phase < DONE:
                     if phase == NEWTON and (status.passes == passes or not block.any_of(status.active)):
@@ -303,6 +307,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         sweep.inward(m, here, phase, ck, links, motions, loads)
                         root = sweep.accelerate(m, here, phase, ck, links, motions, loads[0], root)
                         if phase == NEWTON:
+                            if wp.static(PAIRS):
+                                root = pairs.correct_step(m, here, links, contacts, motions, root, status)
                             root, status = newton.newton_step(
                                 m, here, links, free_loads, motions, contacts, root, status
                             )
@@ -319,6 +325,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     record_accelerations(m, here, ck, NV, root.newton_vdot, root.newton_wdot, motions)
                     if wp.static(CONTACT):
                         constraint.record_contacts(m, here, ck, contacts)
+                    if wp.static(PAIRS):
+                        pairs.record(here, ck, contacts)
                 for i in range(1, here.n):
                     motions[i].u = motions[i].accel_joint
                 if wp.static(not DAMPED):

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from diffsim.kernels.lanes import Division
+from diffsim.kernels.records import PAIR_FIELDS, constraint_records
 from diffsim.kernels.spec import KernelSpec
 from diffsim.robot.drag import drag
 from diffsim.robot.scene import Scene
@@ -175,7 +176,7 @@ FIELDS: dict[str, Field] = {
     "contact_begin": ("ints", lambda n: n.spheres[0]),  # of each entry, in the spheres
     "contact_position": ("vec3s", lambda n: n.scene.contact_position[n.spheres[1]]),  # m, centre in the link's frame
     "contact_radius": ("reals", lambda n: n.scene.contact_radius[n.spheres[1]]),  # m
-    # MuJoCo's constraints: rows of robot.scene.Constraints
+    # MuJoCo's constraints: rows of robot.constraint.Constraints
     "contact_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.contact[n.spheres[1]]),
     "contact_axis": ("vec3s", lambda n: n.scene.constraints and n.scene.constraints.axis[n.spheres[1]]),
     "limit_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.limit[n.link]),
@@ -208,14 +209,15 @@ def struct(name: str, fields: dict[str, Any]) -> Any:
 
 
 @cache
-def scene_types(dtype: type) -> SimpleNamespace:
-    """Make Warp's vector types of a scene's numbers, and the struct Model of them."""
+def scene_types(dtype: type, paired: bool) -> SimpleNamespace:
+    """Make Warp's vector types of a scene's numbers, and the struct Model of them, with rows between bodies or not."""
     kinds: dict[str, Any] = {f"vec{n}": wp.types.vector(n, dtype) for n in (3, 4, 11)}
     kinds |= {"real": dtype, "int": wp.int32, "mat3": wp.types.matrix((3, 3), dtype)}
     arrays = {f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()}
     arrays |= {f"{name}ss": wp.array2d(dtype=kind) for name, kind in kinds.items()}
+    fields = FIELDS | (PAIR_FIELDS if paired else {})
     return SimpleNamespace(
-        **kinds, Model=struct("Model", {name: (kinds | arrays)[kind] for name, (kind, _) in FIELDS.items()})
+        **kinds, Model=struct("Model", {name: (kinds | arrays)[kind] for name, (kind, _) in fields.items()})
     )
 
 
@@ -336,66 +338,23 @@ def types(spec: KernelSpec) -> SimpleNamespace:
             "newton_vdot": vec3,  # linear acceleration of Newton's iterate
             "newton_wdot": vec3,  # angular acceleration of Newton's iterate
         },
-        # Newton's method of an environment
-        "Newton": {
-            "tolerance": T,  # of the residual
-            "active": T,  # 1 until the environment has converged, then 0
-            "residual_sq": T,  # square of the residual
-            "accel_sq": T,  # 1 plus the square of the acceleration
-            "passes": int,  # so far
-        },
-        # A contact with MuJoCo's law
-        "Contact": {
-            "p": vec3,  # the contact point, about the carrier
-            "jar": vec3,  # J a - aref of the iterate
-            "f": vec3,  # force of the iterate
-            "trial_jar": vec3,  # jar after the trial step
-            "trial_force": vec3,  # force after the trial step
-            "Hs": vec3,  # H of the iterate times the step
-            "H": mat3,  # minus the force's derivatives in jar, of the last trial step
-            "D": T,  # inverse of the regularised inertia
-            "active": T,  # 1 within the margin
-        },
     }
     if "clamp" in spec.features:
         structs["Node"] |= {
             "motor": T,  # force of the joint's motors
             "unclamped": T,  # 1 where the actuators' force is within its bounds
         }
-    if spec.constrained:
-        structs["Node"] |= {
-            "B": vec6,  # sum of S qacc, the twist that gives J a (constraint.py)
-            "qacc": T,  # the joint's acceleration before damping
-        }
-        structs["Adjoint"] |= {"b": vec6}  # B
-        structs["Motion"] |= {
-            "accel_link": vec6,  # acceleration of the link, of Newton's iterate
-            "limit": vec3,  # the limit's row, see constraint.limit_state
-            "accel_joint": T,  # acceleration of the joint, of Newton's iterate
-            "free_force": T,  # force of the joint without constraints
-            "con_force": T,  # force of its constraints
-            "con_slope": T,  # minus the derivative of con_force
-            "trial_force": T,  # con_force after the trial step
-            "trial_slope": T,  # con_slope after the trial step
-        }
-    if spec.damped:
-        structs["Node"] |= {
-            "D": vec6,  # what damping adds to B
-            "W1": vec6,  # twist under lambda of the damped solve
-        }
-        structs["Adjoint"] |= {
-            "d": vec6,  # D
-            "w1": vec6,  # W1
-        }
-    if spec.framed:
-        structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
+    own, more = constraint_records(spec, T, vec3, vec6, mat3, mat6)
+    structs |= own
+    for name, members in more.items():
+        structs[name] |= members
     kinds |= {name: struct(name, members) for name, members in structs.items()}
     return SimpleNamespace(
         **kinds,
         **{f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()},
         **{"U": U, "vec2": vec2, "vec4": vec4, "mat6": mat6, "array2": array2, "array3": array3},
-        scene=scene_types(U),
-        Model=scene_types(U).Model,
+        scene=scene_types(U, spec.pairs > 0),
+        Model=scene_types(U, spec.pairs > 0).Model,
         CarrierPos=vec2 if "terrain" in spec.features else T,  # the carrier's (x, z), or its height
         Frame=mat3 if spec.framed else T,  # of a contact: E of terrain.py, or the world's, of which is 1
     )
@@ -408,9 +367,11 @@ def functions(names: dict[str, Any]) -> SimpleNamespace:
 
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     """Put the scene's numbers into a Model on a device."""
-    Model, entries = scene_types(dtype).Model, _Entries(scene, division)
+    Model, entries = scene_types(dtype, scene.npairs > 0).Model, _Entries(scene, division)
     model = Model()
-    for name, (_, source) in FIELDS.items():
+    for name, (_, source) in (FIELDS | PAIR_FIELDS).items():
+        if name not in Model.vars:
+            continue
         kind, values = Model.vars[name].type, source(entries)
         if isinstance(kind, wp.array) and values is not None:
             values = np.ascontiguousarray(values, np.int32 if kind.dtype is wp.int32 else float)

@@ -20,6 +20,7 @@ from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.model import functions, types
+from diffsim.kernels.pairs import pair_rows
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -43,6 +44,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
     JOINT_ROWS, SHARED, FULL_STEPS = LIMIT or LOSS, spec.threads_per_env > 1, FULL_STEP_PASSES[LOSS]
     ROUNDING = ROUND_OFF * (6e-8 if t.U == wp.float32 else 1.1e-16)
     FIRST = 0 if spec.floating else 1 + spec.inert  # the first link with inertia
+    PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
 
     @wp.func
     def initialize(m: Model, here: Lane, links: Links, motions: Motions, loads: Loads, free_loads: Loads, root: Root):
@@ -76,6 +78,8 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                 if i >= FIRST:
                     load = constraint.add_contacts(m, here, here.at + i, contacts, load)
             loads[i] = load
+        if wp.static(PAIRS):
+            pairs.add_forces(m, here, contacts, motions, loads)
 
     @wp.func
     def evaluate_trial(
@@ -111,6 +115,8 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             if wp.static(CONTACT):
                 if i >= FIRST:
                     total = total + constraint.trial_contacts(m, here, k, motions[i].A, alpha, evaluation, contacts)
+        if wp.static(PAIRS):
+            total = total + pairs.trial(m, here, motions, alpha, contacts)
         if wp.static(SHARED):
             for r in range(5):
                 total[r] = sums.add(total[r])
@@ -254,6 +260,8 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             motions[i].con_slope = motions[i].trial_slope
         if wp.static(CONTACT):
             constraint.accept_contacts(m, here, contacts)
+        if wp.static(PAIRS):
+            pairs.accept(here, contacts)
         status.passes = status.passes + 1
         return root, status
 

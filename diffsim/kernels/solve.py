@@ -114,6 +114,7 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
     FLOATING, IMPLICIT, CONSTRAINED = spec.floating, spec.implicit, spec.constrained
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
     BASE_DAMPED, CLAMP = spec.has("base_damping clamp")
+    PAIRS = spec.pairs > 0
 
     @wp.func
     def joint_force(m: Model, here: Lane, k: int, phase: int, link: Link, motion: Motion, d: T):
@@ -132,6 +133,8 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
             else:
                 d = d + motion.con_slope
                 f = motion.free_force + motion.con_force - T(m.armature[k]) * motion.accel_joint
+                if wp.static(PAIRS):
+                    f = f + motion.rate
         else:
             f = joint.force(m, here, k, motion.motor, link.q, link.qd)
         return f, d
@@ -202,6 +205,8 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
                 load = base.damp_base(m, here, phase == SOLVE, links[0], load, root)
             L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
             motions[0].A = a0
+            if wp.static(PAIRS):
+                root.L = L
             root.wdot = wp.transpose(links[0].R) * wp.spatial_top(a0)
             root.vdot = wp.spatial_bottom(a0)
             if wp.static(not CONSTRAINED):

@@ -34,6 +34,7 @@ class KernelSpec:
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
     constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
     spheres: int = 0  # with constraints, the most contact spheres of a lane
+    pairs: int = 0  # number of blocks of rows between two bodies (pairs.py)
 
     def has(self, names: str) -> list[bool]:
         """Return for each of these features whether the scene has it."""
@@ -47,6 +48,11 @@ class KernelSpec:
     def framed(self) -> bool:
         """Tell whether contacts have frames of their own: on a terrain, and in pyramidal cones."""
         return bool(self.features & {"terrain", "pyramid"})
+
+    @property
+    def room(self) -> int:
+        """Return the number of links in local arrays: the last one is the world, where rows between bodies need it."""
+        return self.slots + int(self.pairs > 0)
 
     @property
     def dof0(self) -> int:
@@ -88,5 +94,6 @@ def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = Fa
         forced=scene.nbody if forced else 0,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
         spheres=max(map(len, division.spheres)) if options.get("constrained") else 0,
+        pairs=scene.npairs,
         **options,
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from diffsim.robot.contact import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
-from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, SceneError, takes_euler
+from diffsim.robot.pairs import Pairs, rows_of
+from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene, SceneError, takes_euler
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
@@ -22,6 +24,18 @@ LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
 LEAST_WEIGHT, LEAST_WEIGHT_SINGLE = 1e-15, 1e-7
 MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precision still holds
 LEAST_SOFTNESS = 1e-6  # of a pyramid's edges, at which Newton's method fails in single precision
+
+
+class Constraints(NamedTuple):
+    """Parameters of MuJoCo's constraints, for one length of a substep."""
+
+    # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
+    # midpoint and power; margin [m]
+    contact: Array
+    axis: Array  # (nc, 3) see Spheres
+    limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
+    loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
+    pairs: Pairs | None = None  # rows between two bodies, see robot/pairs.py
 
 
 def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
@@ -36,6 +50,11 @@ def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
     fastest = 0.0 if "refsafe" in disabled_flags(m) else 2 * seconds
     ground = ground_pairs(m)[0][0] if len(scene.spheres.geom) else 0
     contact = [_contact(scene, ground, geom, fastest, single) for geom in scene.spheres.geom.tolist()]
+    least = LEAST_WEIGHT_SINGLE if single else LEAST_WEIGHT
+
+    def row(solref: Array, solimp: Array, weight: float, what: str) -> Array:
+        return _in_range(_numbers(solref, solimp, max(weight, least), 0.0, fastest), f"{scene.name}: {what}")
+
     first = m.nv - scene.nlink + 1
     limit, loss = np.tile(_numbers((1.0, 1.0), (0.9, 0.9, 1.0, 0.5, 2.0), 1.0, 0.0), (scene.nlink, 1)), []
     for link, dof in enumerate(range(first, m.nv), start=1):
@@ -58,7 +77,11 @@ def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
         contact_position=scene.spheres.centre,
         contact_radius=scene.spheres.radius,
         constraints=Constraints(
-            np.array(contact).reshape(-1, 11), scene.spheres.axis, limit, np.array([(0.0, 1.0, 0.0), *loss])
+            np.array(contact).reshape(-1, 11),
+            scene.spheres.axis,
+            limit,
+            np.array([(0.0, 1.0, 0.0), *loss]),
+            rows_of(scene, row),
         ),
     )
 
@@ -70,6 +93,9 @@ def check_soft(scene: Scene) -> None:
     if joints:
         names = listed(label(m, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints)
         raise SceneError(f"{scene.name}: soft contact has no frictionloss (joint {names}); choose MuJoCo's contact")
+    if rows := np.flatnonzero(m.eq_active0).tolist():
+        names = listed(label(m, mujoco.mjtObj.mjOBJ_EQUALITY, k) for k in rows)
+        raise SceneError(f"{scene.name}: soft contact has no equality constraints ({names}); choose MuJoCo's contact")
     unnamed = [name for name in PENALTY_CONSTANTS if np.isnan(getattr(scene, name)).any()]
     if missing := [name for name in unnamed if scene.ncontact or name.endswith("_limit")]:
         raise SceneError(

@@ -44,14 +44,15 @@ ZERO = """geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_da
     actuator_armature actuator_delay""".split()
 FINITE = """body_pos body_quat geom_friction geom_margin geom_gap geom_solmix geom_solref geom_solimp pair_friction
     pair_margin pair_gap pair_solref pair_solimp jnt_margin jnt_solref jnt_solimp dof_solref dof_solimp
-    dof_frictionloss""".split()
+    dof_frictionloss eq_data eq_solref eq_solimp""".split()
 POSITIVE = "jnt_stiffness dof_armature dof_damping dof_frictionloss geom_friction geom_solmix pair_friction".split()
 # What a file calls them, where that is another word
 WORDS = {"limited": "range", "actfrclimited": "actuatorfrcrange"}
 WORDS |= {"stiffnesspoly": "a second number of stiffness", "dampingpoly": "a second number of damping"}
-ELEMENTS = {"jnt": "joint", "dof": "joint"}
+ELEMENTS = {"jnt": "joint", "dof": "joint", "eq": "equality"}
 ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
+EQUALITIES = "connect", "weld", "joint"
 WITHOUT_EQUALITY = 'remove it, or all of them by <flag equality="disable"/>'
 SECOND = "next to a floating robot no other body has joints, and next to any robot no other one is free"
 ALONE = "or, if it touches nothing, set contype and conaffinity of its geoms to 0"
@@ -99,9 +100,11 @@ def _file(m: mujoco.MjModel) -> Iterator[Row]:
     yield "numeric", wrong, "must be one number, not negative"
     yield "file", ["without a joint"] * (not m.njnt), "there is nothing to simulate"
     yield "flex", np.ones(m.nflex), "deformable bodies are not simulated"
+    active = m.eq_active0 != 0
     for name, kind in mujoco.mjtEq.__members__.items():
-        word = name.removeprefix("mjEQ_").lower()
-        yield "equality", (m.eq_active0 != 0) & (m.eq_type == kind), f"{word} is not simulated; {WITHOUT_EQUALITY}"
+        if (word := name.removeprefix("mjEQ_").lower()) not in EQUALITIES:
+            yield "equality", active & (m.eq_type == kind), f"{word} is not simulated; {WITHOUT_EQUALITY}"
+    yield "equality", active & _mixed(m.eq_solref), "solref mixes a positive with another number"
     yield "plugin", np.ones(m.nplugin), "plugins are not simulated"
 
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.terrain import TerrainError, check_terrain
+
+if TYPE_CHECKING:
+    from diffsim.robot.constraint import Constraints
+    from diffsim.robot.pairs import Pairs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -50,17 +54,6 @@ class Spheres(NamedTuple):
     radius: Array  # (n,)
     geom: Index  # (n,) the geom that each stands for
     axis: Array  # (n, 3) a capsule's unit vector along it, of a box's corner its place from the centre [m], else 0
-
-
-class Constraints(NamedTuple):
-    """Parameters of MuJoCo's constraints, for one length of a substep."""
-
-    # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
-    # midpoint and power; margin [m]
-    contact: Array
-    axis: Array  # (nc, 3) see Spheres
-    limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
-    loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
 
 
 def takes_euler(m: mujoco.MjModel) -> bool:
@@ -161,6 +154,16 @@ class Scene:
         return int((self.ball == 0).sum())
 
     @property
+    def pairs(self) -> Pairs | None:
+        """Return the rows between two bodies, which MuJoCo's constraints may have."""
+        return self.constraints.pairs if self.constraints else None
+
+    @property
+    def npairs(self) -> int:
+        """Return the number of blocks of rows between two bodies."""
+        return len(self.pairs.kind) if self.pairs else 0
+
+    @property
     def qpos_adr(self) -> Index:
         """Return the index in qpos (nlink,) of each link's joint, w, x and y of its quaternion for a ball joint."""
         passed = np.concatenate([[0], np.cumsum(self.ball == 2)[:-1]])  # balls, each one number longer than its rates
@@ -207,7 +210,8 @@ class Scene:
             "muscle": len(self.segment_muscle) > 0,
             "drag": self.density > 0 or self.viscosity > 0,
         }
-        return frozenset(name for name, used in present.items() if used)
+        rows = self.pairs.features if self.pairs else frozenset[str]()
+        return frozenset(name for name, used in present.items() if used) | rows
 
     @property
     def carrier(self) -> int:
@@ -219,7 +223,8 @@ class Scene:
         link = 0
         while not self.floating and link + 1 < self.nlink and self.slide[link + 1]:
             children = np.flatnonzero(self.parent[1:] == link) + 1
-            if len(children) != 1 or self.mass[link] > 0 or link in self.contact_link or link in self.segment_link:
+            busy = [*self.contact_link, *self.segment_link.flat, *(self.pairs.link.flat if self.pairs else [])]
+            if len(children) != 1 or self.mass[link] > 0 or link in busy:
                 break
             link += 1
         return link

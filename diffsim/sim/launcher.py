@@ -128,7 +128,7 @@ class Launcher:
         of both solves if damping follows the constraints.
         """
         spec, n, result = self.spec, self.num_envs, types(self.spec).Checkpoint()
-        accelerations = 2 * spec.nv + 3 * self.scene.ncontact if spec.constrained else spec.nv
+        accelerations = 2 * spec.nv + 3 * (self.scene.ncontact + spec.pairs) if spec.constrained else spec.nv
         widths = (spec.nq, spec.nv, accelerations, spec.nfactor)
         counts = (count, count, count, spec.solves * count)
         numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
@@ -152,7 +152,7 @@ def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
 def default_division(scene: Scene, num_envs: int) -> Division:
     """Choose the division of an environment among GPU threads, as measured in docs/performance.md."""
     sharers = MUSCLE_SHARERS if "muscle" in scene.features else 1
-    candidates = [divide(scene, groups * sharers, sharers) for groups in (1, 2, 4)]
+    candidates = [divide(scene, groups * sharers, sharers) for groups in ((1, 2, 4) if not scene.npairs else (1,))]
     best = min(candidates, key=lambda division: (division.slots, division.threads_per_env))
     return best if best.threads_per_env * num_envs <= MAX_THREADS else divide(scene)
 

@@ -70,11 +70,12 @@ REFUSED = {  # what the variants of test_variants.py have not
         slides("1e-8"),
     ],
     # equality
-    "equality 'loop': connect is not simulated; remove it, or all of them by <flag equality=\"disable\"/>": pendulum(
-        rest='<equality><connect name="loop" body1="arm" anchor="0 0 0"/></equality>'
+    "equality 'same': tendon is not simulated; remove it, or all of them by <flag equality=\"disable\"/>": pendulum(
+        rest='<tendon><fixed name="t"><joint joint="hinge" coef="1"/></fixed></tendon>'
+        '<equality><tendon name="same" tendon1="t"/></equality>'
     ),
-    "equality 'mimic': joint is not simulated": pendulum(
-        rest='<equality><joint name="mimic" joint1="hinge"/></equality>'
+    "equality 'mimic': solref mixes a positive with another number": pendulum(
+        rest='<equality><joint name="mimic" joint1="hinge" solref="0.02 -1"/></equality>'
     ),
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),

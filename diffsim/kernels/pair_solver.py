@@ -1,0 +1,176 @@
+"""Newton's matrix with rows between two bodies: conjugate gradients, preconditioned by the tree.
+
+A row between links i and j acts on both, so it adds a block to no single link's inertia, and Newton's matrix leaves
+the tree:
+
+    H = T + U' C U.
+
+T is the tree's matrix with the ground's contacts and the limits, whose inverse is one articulated-body pass. U has the
+rows between bodies, and C the slopes of their forces. Conjugate gradients preconditioned by T^-1 (Saad, Iterative
+Methods for Sparse Linear Systems, 2003, algorithm 9.1) solve H s = b, starting from s_0 = T^-1 b. Their first
+residual, b - H s_0 = -U' C U s_0, is the image of forces of the rows, and so are all others. With such forces, r = U' p
+and T d = U' q of the search direction d, only numbers of rows are kept, and d itself is never needed:
+
+    z = U T^-1 U' p,   beta = p.z / (p.z)_last,   q = p + beta q,   v = U d = z + beta v,
+    alpha = p.z / v.(q + C v),   y += alpha q,   p -= alpha (q + C v).
+
+At the end s = s_0 + T^-1 U' y. In exact arithmetic this takes at most rank(U) steps, each a tree solve with the
+factor that the pass has already. The adjoint solves with the same symmetric H.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.model import functions, types
+from diffsim.kernels.pair_geometry import pair_geometry
+from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
+from diffsim.robot.pairs import JOINT
+
+# The search ends where p.z, the square of the residual in the norm of T^-1, is small in comparison with that of b, or
+# without another solve where the residual is as good as 0: this multiple of that goal in the rows' accelerations
+ROUND_OFF = 1e-6
+
+
+@cache
+def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
+    """Make the conjugate gradients on branches, the array of structs ("Motions" or "Nodes") that has T's factor."""
+    t, block, geometry = types(spec), blocks(spec), pair_geometry(spec)
+    T, vec3, vec6, mat6, pick = t.T, t.vec3, t.vec6, t.mat6, block.pick
+    Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
+    FLOATING, FIRST, ROOM = spec.floating, max(spec.spheres, 1), spec.room
+    STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
+
+    @wp.func
+    def clear(branches: Branches):
+        room = int(ROOM)
+        for i in range(room):
+            branches[i].twist = vec6()
+            branches[i].rate = T(0.0)
+
+    @wp.func
+    def spread(m: Model, s: int, contacts: Contacts, f: vec3, branches: Branches):
+        """Add the rows' forces f to the right-hand side: to the links' bias forces, and to the joints' forces."""
+        i = m.row_link[2 * s]
+        j = m.row_link[2 * s + 1]
+        first, second = geometry.wrenches(m, s, contacts, f)
+        branches[i].twist = branches[i].twist + first
+        branches[j].twist = branches[j].twist - second
+        if m.row_kind[s] == JOINT:
+            branches[i].rate = branches[i].rate - contacts[FIRST + s].slope * f[0]
+            branches[j].rate = branches[j].rate + f[0]
+
+    @wp.func
+    def solve_cholesky(L: mat6, b: vec6):
+        """Return I^-1 b by the base's Cholesky factor L."""
+        a = b
+        for r in range(6):
+            y = a[r]
+            for k in range(r):
+                y = y - L[r, k] * a[k]
+            a[r] = y * L[r, r]
+        for rr in range(6):
+            r = 5 - rr
+            y = a[r]
+            for k in range(r + 1, 6):
+                y = y - L[k, r] * a[k]
+            a[r] = y * L[r, r]
+        return a
+
+    @wp.func
+    def solve_tree(m: Model, here: Lane, links: Links, branches: Branches, L: mat6):
+        """Solve T x = forces: twist and rate have the forces on entry, see spread, and x on return."""
+        for k in range(1, here.n):
+            i = here.n - k
+            p = m.parent[i]
+            own = branches[i].twist
+            u = branches[i].rate - wp.dot(links[i].S, own)
+            branches[i].rate = u
+            if wp.static(FLOATING) or p > 0:
+                branches[p].twist = branches[p].twist + own + branches[i].U * (u * branches[i].dinv)
+        if wp.static(FLOATING):
+            branches[0].twist = solve_cholesky(L, -branches[0].twist)
+        else:
+            branches[0].twist = vec6()
+        for i in range(1, here.n):
+            A = branches[m.parent[i]].twist
+            accel = (branches[i].rate - wp.dot(branches[i].U, A)) * branches[i].dinv
+            branches[i].rate = accel
+            branches[i].twist = A + links[i].S * accel
+        branches[ROOM - 1].twist = vec6()
+        branches[ROOM - 1].rate = T(0.0)
+
+    @wp.func
+    def rates_of(m: Model, s: int, contacts: Contacts, branches: Branches):
+        i = m.row_link[2 * s]
+        j = m.row_link[2 * s + 1]
+        a, b = branches[i].twist, branches[j].twist
+        return geometry.rates(m, s, contacts, a, b, branches[i].rate, branches[j].rate)
+
+    @wp.func
+    def solve(
+        m: Model, here: Lane, links: Links, contacts: Contacts, branches: Branches, L: mat6, active: T, accuracy: T
+    ):
+        """Solve H s = b where active is 1, given U s_0 as the blocks' rates: branches get s - s_0, blocks their y."""
+        goal = T(0.0)
+        for k in range(here.listed):
+            s = contacts[FIRST + k].listed
+            c = FIRST + s
+            p = contacts[c].H * contacts[c].rate
+            for r in range(3):
+                p[r] = pick(T(0.0), active, -p[r], T(0.0))
+            contacts[c].residual = p
+            contacts[c].change = vec3()
+            contacts[c].direction = vec3()
+            contacts[c].rate = vec3()
+            goal = goal + T(m.row_params[s][4]) * wp.dot(p, p)
+        goal = T(ROUND_OFF) * accuracy * accuracy * goal
+        running = pick(T(0.0), goal, T(1.0), T(0.0))
+        enough = T(0.0)
+        last = T(0.0)
+        step = int(0)
+        while step < STEPS and block.any_of(running):
+            clear(branches)
+            for k in range(here.listed):
+                s = contacts[FIRST + k].listed
+                spread(m, s, contacts, contacts[FIRST + s].residual, branches)
+            solve_tree(m, here, links, branches, L)
+            pz = T(0.0)
+            for k in range(here.listed):
+                s = contacts[FIRST + k].listed
+                pz = pz + wp.dot(contacts[FIRST + s].residual, rates_of(m, s, contacts, branches))
+            running = pick(enough, pz, running, T(0.0))
+            beta = pick(T(0.0), last, pz / last, T(0.0))
+            last = pz
+            curvature = T(0.0)
+            for k in range(here.listed):
+                s = contacts[FIRST + k].listed
+                c = FIRST + s
+                q = contacts[c].residual + beta * contacts[c].direction
+                v = rates_of(m, s, contacts, branches) + beta * contacts[c].rate
+                contacts[c].direction = q
+                contacts[c].rate = v
+                curvature = curvature + wp.dot(v, q + contacts[c].H * v)
+            alpha = pick(T(0.0), running, pick(T(0.0), curvature, pz / curvature, T(0.0)), T(0.0))
+            if step == 0:  # 1 / alpha is about the factor by which s_0's residual exceeds b
+                enough = accuracy * accuracy * alpha * alpha * pz
+            left = T(0.0)
+            for k in range(here.listed):
+                s = contacts[FIRST + k].listed
+                c = FIRST + s
+                q = contacts[c].direction
+                contacts[c].change = contacts[c].change + alpha * q
+                contacts[c].residual = contacts[c].residual - alpha * (q + contacts[c].H * contacts[c].rate)
+                p = contacts[c].residual
+                left = left + T(m.row_params[s][4]) * wp.dot(p, p)
+            running = pick(goal, left, running, T(0.0))
+            step = step + 1
+        clear(branches)
+        for k in range(here.listed):
+            s = contacts[FIRST + k].listed
+            spread(m, s, contacts, contacts[FIRST + s].change, branches)
+        solve_tree(m, here, links, branches, L)
+
+    return functions(locals())

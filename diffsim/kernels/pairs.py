@@ -1,0 +1,351 @@
+"""Rows of MuJoCo's constraints between two bodies, and their adjoint: equality constraints.
+
+A row has J a = E' (A_j - A_i) of the links' accelerations (pair_geometry.py). Its force acts on both links, so
+Newton's matrix leaves the tree, and conjugate gradients take part in each pass (pair_solver.py). They find the change
+of the rows' forces, which takes the place of -H s in the line search (newton.py). So that one accounts for their error.
+
+Equality has the force -D jar whatever its sign. Impedance and stiffness are those of the norm of its violation, which
+the two blocks of a weld share (MuJoCo's mj_instantiateEquality and mj_makeImpedance).
+
+The adjoint begins at phi = -f . rate with rate the rows' velocity under lambda, as for contacts (constraint.py).
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.constraint import constraint_law
+from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.model import functions, types
+from diffsim.kernels.pair_geometry import pair_geometry
+from diffsim.kernels.pair_solver import row_solver
+from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
+from diffsim.robot.pairs import JOINT, POINT, TURN
+
+ACCURACY = 1e-2  # of a Newton step, in multiples of the first residual
+ACCURACY_ADJOINT = 1e-12, 1e-6  # of the adjoint's solve, in float64 and in float32
+SMALLEST = 1e-12  # of a violation whose direction is defined
+
+
+@cache
+def pair_rows(spec: KernelSpec) -> SimpleNamespace:
+    """Make the rows' part of Newton's method and of the adjoint."""
+    t, sp, block, kin, geometry = types(spec), spatial(spec), blocks(spec), kinematics(spec), pair_geometry(spec)
+    forward, backward, constraint = row_solver(spec, "Motions"), row_solver(spec, "Nodes"), constraint_law(spec)
+    T, vec3, vec4, vec6, mat3, mat6, pick, join = t.T, t.vec3, t.vec4, t.vec6, t.mat3, t.mat6, block.pick, sp.join
+    Model, Lane, Ck, Links, Contacts, Motions, Loads = (
+        getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Motions Loads".split()
+    )
+    Nodes, Adjoints, Root, Newton, force_at = t.Nodes, t.Adjoints, t.Root, t.Newton, sp.force_at
+    FLOATING, NV, SOLVES, PAIRS, WORLD = spec.floating, spec.nv, spec.solves, spec.pairs, spec.room - 1
+    FIRST, COLUMN = max(spec.spheres, 1), 2 * NV + 3 * spec.spheres  # of jar in the checkpoint
+    BASE, VADR = 7 * (spec.nlink - 1), spec.dof0 - 1
+    JOINTS, POINTS, TURNS = spec.has("joint_rows point_rows turn_rows")
+    ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]
+
+    @wp.func
+    def place_world(links: Links, origin: vec3):
+        """Place the world, beside a floating base about which all else is."""
+        if wp.static(FLOATING):
+            links[WORLD].R = wp.identity(3, dtype=T)
+            links[WORLD].x = -origin
+
+    @wp.func
+    def equality_state(m: Model, s: int, r: vec3):
+        """Return D, its derivative by the norm of the violation, and k d and that of it; r is the block's own part."""
+        params = m.row_params[s]
+        state = constraint.impedance_row(params, T(1.0), -wp.length(r))
+        Dw = state[0] * T(params[4])
+        d = Dw / (T(1.0) + Dw)
+        k = T(params[0])
+        return vec4(state[0], -state[0] * state[1], k * d, -k * d * state[1] / (T(1.0) + Dw))
+
+    @wp.func
+    def norm_of(m: Model, s: int, links: Links):
+        """Return the block's violation, and the norm of that of its constraint as a vector along x."""
+        r = geometry.violation(m, s, links)
+        partner = m.row_partner[s]
+        if partner == s:
+            return r, r
+        other = geometry.violation(m, partner, links)
+        return r, vec3(wp.sqrt(wp.dot(r, r) + wp.dot(other, other)), T(0.0), T(0.0))
+
+    @wp.func
+    def law(m: Model, s: int, D: T, jar: vec3):
+        """Return the force of the rows, and H, minus its derivatives in jar."""
+        H = D * wp.identity(3, dtype=T)
+        if wp.static(JOINTS):
+            if m.row_kind[s] == JOINT:
+                H = wp.diag(vec3(D, T(0.0), T(0.0)))
+        return -(H * jar), H
+
+    @wp.func
+    def velocity_of(m: Model, s: int, links: Links, contacts: Contacts):
+        i = m.row_link[2 * s]
+        j = m.row_link[2 * s + 1]
+        return geometry.rates(m, s, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
+
+    @wp.func
+    def begin(m: Model, here: Lane, links: Links, motions: Motions, origin: vec3, contacts: Contacts):
+        """Set up the blocks at the start of a substep, with zero acceleration; returns the number of active ones."""
+        place_world(links, origin)
+        motions[WORLD].accel_link = join(vec3(), -vec3(m.gravity))
+        count = int(0)
+        pairs = int(PAIRS)
+        for s in range(pairs):
+            c = FIRST + s
+            geometry.place(m, s, links, contacts)
+            contacts[FIRST + count].listed = s
+            count = count + 1
+            r, norm = norm_of(m, s, links)
+            state = equality_state(m, s, norm)
+            velocity = velocity_of(m, s, links, contacts)
+            jar = T(m.row_params[s][1]) * velocity + state[2] * r
+            i = m.row_link[2 * s]
+            j = m.row_link[2 * s + 1]
+            jar = jar + geometry.drift(m, s, links, contacts, motions[i].accel_link, motions[j].accel_link)
+            f, H = law(m, s, state[0], jar)
+            contacts[c].D = state[0]
+            contacts[c].jar = jar
+            contacts[c].f = f
+            contacts[c].H = H
+        return count
+
+    @wp.func
+    def add_forces(m: Model, here: Lane, contacts: Contacts, motions: Motions, loads: Loads):
+        """Add the iterate's forces to the links' loads, and those on joints to the joints' rate."""
+        forward.clear(motions)
+        for k in range(here.listed):
+            s = contacts[FIRST + k].listed
+            forward.spread(m, s, contacts, contacts[FIRST + s].f, motions)
+        for i in range(here.n):
+            loads[i].f = loads[i].f + motions[i].twist
+
+    @wp.func
+    def correct_step(
+        m: Model, here: Lane, links: Links, contacts: Contacts, motions: Motions, root: Root, status: Newton
+    ):
+        """Turn the tree's Newton step into that with the rows between bodies."""
+        for k in range(here.listed):
+            s = contacts[FIRST + k].listed
+            i = m.row_link[2 * s]
+            j = m.row_link[2 * s + 1]
+            contacts[FIRST + s].rate = geometry.rates(
+                m, s, contacts, motions[i].A, motions[j].A, motions[i].u, motions[j].u
+            )
+        forward.solve(m, here, links, contacts, motions, root.L, status.active, T(ACCURACY))
+        for k in range(here.listed):
+            c = FIRST + contacts[FIRST + k].listed
+            contacts[c].Hs = -contacts[c].change
+        motions[0].A = motions[0].A + motions[0].twist
+        if wp.static(FLOATING):
+            root.wdot = root.wdot + wp.transpose(links[0].R) * wp.spatial_top(motions[0].twist)
+            root.vdot = root.vdot + wp.spatial_bottom(motions[0].twist)
+        for i in range(1, here.n):
+            motions[i].u = motions[i].u + motions[i].rate
+            motions[i].A = motions[m.parent[i]].A + links[i].S * motions[i].u
+        return root
+
+    @wp.func
+    def trial(m: Model, here: Lane, motions: Motions, alpha: T, contacts: Contacts):
+        """Evaluate the rows after the trial step alpha s; returns their part of newton.evaluate_trial."""
+        total = vec6()
+        for k in range(here.listed):
+            s = contacts[FIRST + k].listed
+            c = FIRST + s
+            i = m.row_link[2 * s]
+            j = m.row_link[2 * s + 1]
+            step_jar = geometry.rates(m, s, contacts, motions[i].A, motions[j].A, motions[i].u, motions[j].u)
+            jar = contacts[c].jar + alpha * step_jar
+            f, H = law(m, s, contacts[c].D, jar)
+            force_error = contacts[c].f - alpha * contacts[c].Hs - f
+            w = T(m.row_params[s][4])
+            accel_error = constraint.acceleration_for(force_error, w, H)
+            total = total + vec6(
+                wp.dot(step_jar, force_error),
+                wp.dot(step_jar, contacts[c].Hs),
+                wp.dot(step_jar, H * step_jar),
+                wp.dot(accel_error, accel_error),
+                w * wp.trace(H),
+                T(0.0),
+            )
+            contacts[c].trial_jar = jar
+            contacts[c].trial_force = f
+            contacts[c].H = H
+        return total
+
+    @wp.func
+    def accept(here: Lane, contacts: Contacts):
+        """Accept the last trial step."""
+        for k in range(here.listed):
+            c = FIRST + contacts[FIRST + k].listed
+            contacts[c].jar = contacts[c].trial_jar
+            contacts[c].f = contacts[c].trial_force
+
+    @wp.func
+    def record(here: Lane, ck: Ck, contacts: Contacts):
+        """Store jar of the blocks in the checkpoint."""
+        pairs = int(PAIRS)
+        for s in range(pairs):
+            for r in range(3):
+                kin.store(ck.a, here.row, COLUMN + 3 * s + r, here.e, contacts[FIRST + s].jar[r])
+
+    @wp.func
+    def recall(m: Model, here: Lane, links: Links, origin: vec3, ck: Ck, contacts: Contacts):
+        """Place the blocks as they were in a substep, with the jar that it ended with; returns the number of active."""
+        place_world(links, origin)
+        count = int(0)
+        pairs = int(PAIRS)
+        for s in range(pairs):
+            c = FIRST + s
+            geometry.place(m, s, links, contacts)
+            contacts[FIRST + count].listed = s
+            count = count + 1
+            for axis in range(3):
+                contacts[c].jar[axis] = kin.load(ck.a, here.row, COLUMN + 3 * s + axis, here.e)
+            r, norm = norm_of(m, s, links)
+            state = equality_state(m, s, norm)
+            f, H = law(m, s, state[0], contacts[c].jar)
+            contacts[c].f = f
+            contacts[c].H = H
+        return count
+
+    @wp.func
+    def lambda_rates(m: Model, s: int, contacts: Contacts, nodes: Nodes):
+        i = m.row_link[2 * s]
+        j = m.row_link[2 * s + 1]
+        return geometry.rates(m, s, contacts, nodes[i].W, nodes[j].W, nodes[i].lam, nodes[j].lam)
+
+    @wp.func
+    def correct_lambda(m: Model, here: Lane, links: Links, ck: Ck, contacts: Contacts, nodes: Nodes):
+        """Turn the tree's lambda, and the twists under it, into those with the rows between bodies."""
+        row = SOLVES * here.row + SOLVES - 1
+        for i in range(1, here.n):
+            for r in range(6):
+                nodes[i].U[r] = kin.load(ck.f, row, 7 * (i - 1) + r, here.e)
+            nodes[i].dinv = kin.load(ck.f, row, 7 * (i - 1) + 6, here.e)
+        L = mat6()
+        if wp.static(FLOATING):
+            k = int(BASE)
+            for r in range(6):
+                for c in range(r + 1):
+                    L[r, c] = kin.load(ck.f, row, k, here.e)
+                    k = k + 1
+        for k in range(here.listed):
+            s = contacts[FIRST + k].listed
+            contacts[FIRST + s].rate = lambda_rates(m, s, contacts, nodes)
+        backward.solve(m, here, links, contacts, nodes, L, T(1.0), T(ENOUGH))
+        for i in range(here.n):
+            nodes[i].lam = nodes[i].lam + nodes[i].rate
+            nodes[i].W = nodes[i].W + nodes[i].twist
+
+    @wp.func
+    def add_twist_adjoint(i: int, GA: vec6, GV: vec6, wrench: vec6, links: Links, nodes: Nodes, adj: Adjoints):
+        """Add the adjoints of link i's twists, GA of A, GV of V and -wrench of W, and of turning them with the link."""
+        adj[i].w = adj[i].w - wrench
+        adj[i].a = adj[i].a + GA
+        adj[i].v = adj[i].v + GV + wp.spatial_cross_dual(links[i].V, GA)
+        turned = wp.spatial_cross_dual(nodes[i].A, GA) + wp.spatial_cross_dual(links[i].V, GV)
+        adj[i].p = adj[i].p + turned - wp.spatial_cross_dual(nodes[i].W, wrench)
+
+    @wp.func
+    def add_violation_adjoint(m: Model, s: int, g: vec3, contacts: Contacts, nodes: Nodes, adj: Adjoints):
+        """Add the adjoint g of an equality's violation to those of what it depends on."""
+        i = m.row_link[2 * s]
+        j = m.row_link[2 * s + 1]
+        first, second = geometry.wrenches(m, s, contacts, g)
+        adj[i].p = adj[i].p - first
+        adj[j].p = adj[j].p + second
+        if m.row_kind[s] == JOINT:
+            nodes[i].gq = nodes[i].gq - contacts[FIRST + s].slope * g[0]
+            nodes[j].gq = nodes[j].gq + g[0]
+
+    @wp.func
+    def turn_derivative(scale: T, w: T, v: vec3, g: vec3, rate: vec3):
+        """Differentiate g . (w rate + rate x v) scale by a rotation of j relative to i, both in the frame of i."""
+        a = wp.cross(g, rate)
+        return T(0.5) * scale * (w * a + wp.cross(v, a) - wp.dot(g, rate) * v)
+
+    @wp.func
+    def add_point_adjoint(i: int, p: vec3, b: T, g: vec3, f: vec3, links: Links, nodes: Nodes, adj: Adjoints):
+        """Add the adjoints of link i's point p: g of its acceleration plus b times its velocity, -f of that of W."""
+        V = links[i].V
+        spin = wp.spatial_top(V)
+        across = wp.cross(g, spin)
+        GV = force_at(p, b * g + across) + join(wp.cross(sp.point_velocity(V, p), g), vec3())
+        add_twist_adjoint(i, force_at(p, g), GV, force_at(p, f), links, nodes, adj)
+        g_p = wp.cross(g, wp.spatial_top(nodes[i].A)) + wp.cross(b * g + across, spin)
+        adj[i].p = adj[i].p + force_at(p, g_p - wp.cross(f, wp.spatial_top(nodes[i].W)))
+
+    @wp.func
+    def add_turn_adjoint(m: Model, s: int, b: T, g: vec3, f: vec3, links: Links, nodes: Nodes, adj: Adjoints):
+        """Add the adjoints of both links in a TURN: g of jar, -f of the rows' rate under lambda.
+
+        In the frame R of i, jar is h(accel) - |rate|^2 v scale / 2 + b h(rate), h(x) = scale (w x + x x v).
+        """
+        i = m.row_link[2 * s]
+        j = m.row_link[2 * s + 1]
+        w, v, R = geometry.turn_of(m, s, links)
+        scale = T(0.5) * T(m.row_shape[s][0])
+        rate, accel = geometry.turn_motion(R, links[i].V, links[j].V, nodes[i].A, nodes[j].A)
+        rate_W = wp.transpose(R) * wp.spatial_top(nodes[j].W - nodes[i].W)
+        own = wp.transpose(R) * wp.spatial_top(links[i].V)
+        half_sq = T(0.5) * wp.dot(rate, rate)
+        g_accel = scale * (w * g + wp.cross(v, g))
+        g_rate = b * g_accel - (scale * wp.dot(g, v)) * rate - wp.cross(g_accel, own)
+        g_own = -wp.cross(rate, g_accel)
+        g_rate_W = -scale * (w * f + wp.cross(v, f))
+        # A rotation of j relative to i turns the quaternion, and one of i all vectors in its frame.
+        torque = turn_derivative(scale, w, v, g, accel + b * rate) - turn_derivative(scale, w, v, f, rate_W)
+        torque = torque - (T(0.5) * half_sq) * g_accel
+        turned = wp.cross(accel + wp.cross(own, rate), g_accel) + wp.cross(rate, g_rate) + wp.cross(own, g_own)
+        turned = turned + wp.cross(rate_W, g_rate_W)
+        adj[j].p = adj[j].p + join(R * torque, vec3())
+        adj[i].p = adj[i].p - join(R * (torque + turned), vec3())
+        GA = join(R * g_accel, vec3())
+        wrench = join(-(R * g_rate_W), vec3())
+        add_twist_adjoint(j, GA, join(R * g_rate, vec3()), wrench, links, nodes, adj)
+        add_twist_adjoint(i, -GA, join(R * (g_own - g_rate), vec3()), -wrench, links, nodes, adj)
+
+    @wp.func
+    def add_adjoint(m: Model, here: Lane, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints):
+        """Add the rows' part of phi, -f . rate under lambda, to the adjoints of links and joints."""
+        for k in range(here.listed):
+            s = contacts[FIRST + k].listed
+            c = FIRST + s
+            i = m.row_link[2 * s]
+            j = m.row_link[2 * s + 1]
+            kind = m.row_kind[s]
+            b = T(m.row_params[s][1])
+            rate = lambda_rates(m, s, contacts, nodes)
+            f = contacts[c].f
+            g = contacts[c].H * rate
+            r, norm = norm_of(m, s, links)
+            size = wp.length(norm)
+            state = equality_state(m, s, norm)
+            g_norm = state[1] * wp.dot(contacts[c].jar, rate) + state[3] * wp.dot(g, r)
+            g_norm = pick(T(SMALLEST), size, g_norm / size, T(0.0))
+            add_violation_adjoint(m, s, state[2] * g + g_norm * r, contacts, nodes, adj)
+            partner = m.row_partner[s]
+            if partner != s:
+                other = g_norm * geometry.violation(m, partner, links)
+                add_violation_adjoint(m, partner, other, contacts, nodes, adj)
+            if wp.static(JOINTS):
+                if kind == JOINT:
+                    curvature = geometry.polynomial(m, s, links[i].q - T(m.row_shape[s][1]))[2]
+                    change = f[0] * nodes[i].lam - g[0] * (nodes[i].qacc + b * links[i].qd)
+                    nodes[i].gq = nodes[i].gq + curvature * change
+                    nodes[i].gqd = nodes[i].gqd - contacts[c].slope * b * g[0]
+                    nodes[j].gqd = nodes[j].gqd + b * g[0]
+            if wp.static(POINTS):
+                if kind == POINT:
+                    add_point_adjoint(i, contacts[c].q, b, -g, -f, links, nodes, adj)
+                    add_point_adjoint(j, contacts[c].p, b, g, f, links, nodes, adj)
+            if wp.static(TURNS):
+                if kind == TURN:
+                    add_turn_adjoint(m, s, b, g, f, links, nodes, adj)
+
+    return functions(locals())

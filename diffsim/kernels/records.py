@@ -1,0 +1,102 @@
+"""Structs of MuJoCo's constraints: what the kernels keep of contacts, of Newton's method and of rows between bodies."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from diffsim.kernels.spec import KernelSpec
+
+# Fields of Model with rows between bodies (robot/pairs.py), as FIELDS of model.py
+PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    name: (kind, lambda n, name=name: getattr(n.scene.pairs, name[4:]))
+    for name, kind in (
+        ("row_kind", "ints"),  # of each block
+        ("row_partner", "ints"),  # the block that shares its violation, or itself
+        ("row_params", "vec11s"),  # as rows of robot.constraint.Constraints
+        ("row_shape", "vec11s"),  # numbers of a joint's polynomial, of a weld or of two geoms
+        ("row_first", "vec3s"),  # m, the point on the first link, in its frame
+        ("row_second", "vec3s"),  # m, on the second one
+        ("row_first_frame", "mat3s"),  # the orientation that a weld compares, in the frame of the first link
+        ("row_second_frame", "mat3s"),  # of the second one
+    )
+}
+# Slots of the first and the second link; beside a floating base the world has one of its own
+PAIR_FIELDS["row_link"] = "ints", lambda n: np.where(n.scene.pairs.link < 0, n.scene.nlink, n.scene.pairs.link).flat
+Members = dict[str, dict[str, Any]]  # of each struct, its members and their types
+
+
+def constraint_records(
+    spec: KernelSpec, T: type, vec3: type, vec6: type, mat3: type, mat6: type
+) -> tuple[Members, Members]:
+    """Return the constraints' own structs, and members that others have with them."""
+    structs: Members = {
+        # Newton's method of an environment
+        "Newton": {
+            "tolerance": T,  # of the residual
+            "active": T,  # 1 until the environment has converged, then 0
+            "residual_sq": T,  # square of the residual
+            "accel_sq": T,  # 1 plus the square of the acceleration
+            "passes": int,  # so far
+        },
+        # A contact with MuJoCo's law
+        "Contact": {
+            "p": vec3,  # the contact point, about the carrier
+            "jar": vec3,  # J a - aref of the iterate
+            "f": vec3,  # force of the iterate
+            "trial_jar": vec3,  # jar after the trial step
+            "trial_force": vec3,  # force after the trial step
+            "Hs": vec3,  # H of the iterate times the step
+            "H": mat3,  # minus the force's derivatives in jar, of the last trial step
+            "D": T,  # inverse of the regularised inertia
+            "active": T,  # 1 within the margin
+        },
+    }
+    if spec.framed or spec.pairs:
+        structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
+    members: Members = {"Node": {}, "Adjoint": {}, "Motion": {}, "Root": {}, "Lane": {}}
+    if spec.constrained:
+        members["Node"] |= {
+            "B": vec6,  # sum of S qacc, the twist that gives J a (constraint.py)
+            "qacc": T,  # the joint's acceleration before damping
+        }
+        members["Adjoint"] |= {"b": vec6}  # B
+        members["Motion"] |= {
+            "accel_link": vec6,  # acceleration of the link, of Newton's iterate
+            "limit": vec3,  # the limit's row, see constraint.limit_state
+            "accel_joint": T,  # acceleration of the joint, of Newton's iterate
+            "free_force": T,  # force of the joint without constraints
+            "con_force": T,  # force of its constraints
+            "con_slope": T,  # minus the derivative of con_force
+            "trial_force": T,  # con_force after the trial step
+            "trial_slope": T,  # con_slope after the trial step
+        }
+    if spec.damped:
+        members["Node"] |= {
+            "D": vec6,  # what damping adds to B
+            "W1": vec6,  # twist under lambda of the damped solve
+        }
+        members["Adjoint"] |= {
+            "d": vec6,  # D
+            "w1": vec6,  # W1
+        }
+    if spec.pairs:
+        # A block of rows between two bodies, see pairs.py; p is its point on the second one
+        structs["Contact"] |= {
+            "q": vec3,  # its point on the first one
+            "slope": T,  # of a joint's row, the ratio of the two joints' velocities
+            "residual": vec3,  # of the conjugate gradients, as forces of the rows
+            "direction": vec3,  # of their search, as such forces
+            "rate": vec3,  # acceleration of the rows by the direction
+            "change": vec3,  # of the forces, by the step
+            "listed": int,  # number of the k-th block that is active, in element k
+        }
+        work = {
+            "twist": vec6,  # of the link, by the forces of rows between bodies; in the inward sweep the bias force
+            "rate": T,  # of its joint
+        }
+        members["Motion"] |= work
+        members["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
+        members["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia
+        members["Lane"] |= {"listed": int}  # number of blocks that are active
+    return structs, members

@@ -1,0 +1,163 @@
+"""Rows of MuJoCo's constraints between two bodies: against MuJoCo, and their gradients against differences."""
+
+from __future__ import annotations
+
+import re
+from itertools import count
+
+import mujoco
+import numpy as np
+import pytest
+import test_constraint
+import torch
+from scenes import free_states, parse, pendulum, random_tree
+from test_constraint import H, check_gradients, in_mujoco, step
+from test_gradient import gradients, weights
+
+from diffsim.robot.constraint import constrained
+from diffsim.robot.scene import SceneError
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
+
+enough_passes = test_constraint.enough_passes
+SLOW = pytest.mark.slow  # for its kernels, which no other test needs
+BASES = ["floating", *(pytest.param(base, marks=SLOW) for base in ("fixed", "planar", "ball"))]
+# Of which MuJoCo has added dJ/dt v to connect and weld
+WITH_DRIFT = tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 7)
+needs_drift = pytest.mark.skipif(not WITH_DRIFT, reason="MuJoCo before 3.7 leaves dJ/dt v out of connect and weld")
+
+
+def tied_tree(base, seed):
+    """A random tree (scenes.py) with every kind of equality, between its bodies and to the world."""
+    rng = np.random.default_rng(500 + seed)
+    text, number = random_tree(base, seed).replace('type="box"', 'type="capsule"'), count()
+    text = re.sub(r"<body pos", lambda found: f'<body name="b{next(number)}" pos', text)
+    bodies = [f"b{k}" for k in range(next(number))]
+    joints = [name for name, kind in re.findall(r'<joint name="(joint\d+)" type="(\w+)"', text) if kind != "ball"]
+
+    def words(*values):
+        return " ".join(map(str, values))
+
+    def law():
+        time, ratio, stiffness, damping = rng.uniform((0.01, 0.5, -2000, -100), (0.05, 1.5, -100, -10))
+        ends = rng.uniform((0.5, 0.9, 0.05, 0.2), (0.9, 0.97, 2, 0.8))
+        solref = words(time, ratio) if rng.random() < 0.7 else words(stiffness, damping)
+        return f'solref="{solref}" solimp="{words(*ends, rng.choice([1, 2, 2, 3.5]))}"'
+
+    def place(n):
+        return words(*(0.3 * rng.normal(size=n)))
+
+    (a, b), (c, d), (e, f) = (rng.choice(names, 2, replace=False) for names in (joints, bodies, bodies))
+    rows = f"""
+    <joint joint1="{a}" joint2="{b}" polycoef="{words(*(0.5 * rng.normal(size=5)))}" {law()}/>
+    <joint joint1="{rng.choice(joints)}" polycoef="0.1 0 0 0 0" {law()}/>
+    <connect body1="{c}" body2="{d}" anchor="{place(3)}" {law()}/> <connect body1="{c}" anchor="{place(3)}" {law()}/>
+    <weld body1="{f}" {law()}/> <weld body1="{e}" body2="{f}" torquescale="{rng.uniform(0.3, 2)}" anchor="{place(3)}"
+    relpose="{place(3)} {place(4)}" {law()}/> <joint joint1="{a}" active="false"/>"""
+    return parse(text.replace("</mujoco>", f"<equality> {rows} </equality> </mujoco>"))
+
+
+def tied_states(scene, number, rng):
+    qpos, qvel, ctrl = free_states(scene, number, rng)
+    return qpos, 0.3 * qvel, ctrl
+
+
+@needs_drift
+@pytest.mark.parametrize("base", BASES)
+def test_ten_trees_step_as_in_mujoco(base, rng):
+    """Far from where their constraints would be satisfied, in motion."""
+    errors = []
+    for seed in range(10):
+        scene = tied_tree(base, seed)
+        states = free_states(scene, 8, rng)
+        qvel, expected = step(scene, states)[1], in_mujoco(scene, *states)[1]
+        errors.append(abs(qvel - expected).max(1) / abs(expected - states[1]).max(1))
+    assert np.max(errors) < 1e-6 and np.median(errors) < 1e-10
+    assert {"joint_rows", "point_rows", "turn_rows"} < constrained(scene, H).features and scene.npairs == 0
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_tree_gradient_is_that_of_differences(base, rng):
+    """Where the constraints do not throw the bodies about: there differences would be inexact."""
+    scene = tied_tree(base, 0)
+    states = tied_states(scene, 96, rng)
+    calm = np.argsort(abs(step(scene, states, 4)[1]).max(1))[:6]
+    check_gradients(scene, [x[calm] for x in states], rng)
+
+
+@pytest.mark.parametrize("block", [1, 8])
+def test_single_precision_is_near(block, rng):
+    scene = tied_tree("floating", 0)
+    states, w = tied_states(scene, 9, rng), weights(scene, rng)
+    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=block)
+    assert residual.max() < 1e-4
+    expected = step(scene, states, 4)[1]
+    assert abs(qvel - expected).max() < 1e-4 * abs(expected).max()
+    found, exact = (
+        np.concatenate(gradients(scene, states, w, dtype, control_dt=4 * H, integration=how, block=size), axis=1)
+        for dtype, how, size in (
+            (torch.float32, Integration("mujoco", 4), block),
+            (torch.float64, Integration("mujoco", 4, tolerance=1e-11), 1),
+        )
+    )
+    assert np.linalg.norm(found - exact) < 1e-2 * np.linalg.norm(exact)
+
+
+def test_neighbours_do_not_change_an_environment(rng):
+    """Bit for bit, in states and gradients."""
+    scene, found = tied_tree("floating", 0), []
+    states = tied_states(scene, 8, rng)
+    states[1][::2] *= 100.0
+    sim = Simulator(scene, 8, Integration("mujoco", 4), 4 * H, block=8)
+    for order in (np.arange(8), np.full(8, 3), np.roll(np.arange(8), 5)):
+        start = [torch.tensor(x[order], dtype=torch.float32, requires_grad=True) for x in states]
+        sim.rewind()
+        end = torch.cat(sim.step(*start), 1)
+        all_of = torch.cat((end, *torch.autograd.grad(end.square().sum(), start)), 1)
+        found.append(torch.cat((all_of, sim.residual.unsqueeze(1)), 1)[list(order).index(3)])
+    assert all(torch.equal(row, found[0]) for row in found)
+
+
+# A crank and a rocker, whose coupler closes the loop at sites, and a gripper whose fingers mirror each other.
+FOUR_BAR = """
+<mujoco> <option timestep="0.002"/>
+  <worldbody>
+    <body name="crank"> <joint name="crank" axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 0 0 .1" size=".01"/>
+      <body pos="0 0 .1"> <joint axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 .3 0 .05" size=".01"/>
+        <site name="coupler" pos=".3 0 .05"/> </body> </body>
+    <body pos=".3 0 0"> <joint axis="0 1 0" damping=".01"/> <geom type="capsule" fromto="0 0 0 0 0 .15" size=".01"/>
+      <site name="rocker" pos="0 0 .15"/>
+      <body pos="0 0 .2"> <joint name="left" type="slide" axis="0 1 0" range="0 .05"/> <geom size=".02" pos="0 .05 0"/>
+      </body> <body pos="0 0 .2"> <joint name="right" type="slide" axis="0 -1 0"/> <geom size=".02" pos="0 -.05 0"/>
+      </body> </body>
+  </worldbody>
+  <actuator> <motor joint="crank" ctrlrange="-.1 .1"/> <position joint="left" kp="20" kv="1" ctrlrange="0 .05"/>
+  </actuator>
+  <equality> <connect site1="coupler" site2="rocker"/> <joint joint1="right" joint2="left"/> </equality>
+</mujoco>"""
+
+
+@needs_drift
+def test_a_four_bar_linkage_turns_as_in_mujoco(rng):
+    """Over 100 substeps, and its loop stays closed."""
+    scene, n = parse(FOUR_BAR), 8
+    states = np.zeros((n, scene.nq)), np.zeros((n, scene.nv)), rng.uniform(-1, 1, (n, 2))
+    qpos, qvel, residual = step(scene, states, 100)
+    expected, velocity, _ = in_mujoco(scene, *states, substeps=100)
+    assert residual.max() < 1e-10 and abs(qpos[:, 0]).max() > 0.3
+    np.testing.assert_allclose(qpos, expected, atol=1e-8)
+    np.testing.assert_allclose(qvel, velocity, atol=1e-6)
+    np.testing.assert_allclose(qpos[:, 3], qpos[:, 4], atol=1e-3)
+    check_gradients(scene, (qpos, qvel, states[2]), rng)
+
+
+def test_what_rows_between_bodies_do_not_have_is_named():
+    scene = parse(pendulum(rest='<equality><joint name="lock" joint1="hinge"/></equality>'))
+    with pytest.raises(SceneError, match=r"soft contact has no equality constraints \('lock'\); choose MuJoCo's"):
+        Simulator(scene, 1, Integration())
+    with pytest.raises(ValueError, match="threads_per_env is 2, must be 1 with rows between two bodies"):
+        Simulator(scene, 1, Integration("mujoco", 4), division=(2, 1))
+    far = parse(pendulum(rest='<equality><joint name="lock" joint1="hinge" solref="1e-30 1e-30"/></equality>'))
+    far.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
+    with pytest.raises(SceneError, match="equality 'lock': its solref, solimp, .* is out of range"):
+        Simulator(far, 1, Integration("mujoco", 4))
