@@ -25,8 +25,8 @@ from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 from diffsim.robot.pairs import JOINT, POINT, TURN
 
-ACCURACY = 1e-2  # of a Newton step, in multiples of the first residual
-ACCURACY_ADJOINT = 1e-12, 1e-6  # of the adjoint's solve, in float64 and in float32
+ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterate's, in the norm of T^-1
+ACCURACY_ADJOINT = 1e-12, 1e-6  # the same of the adjoint's solve, in float64 and in float32
 SMALLEST = 1e-12  # of a violation whose direction is defined
 
 
