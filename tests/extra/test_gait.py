@@ -152,7 +152,7 @@ def test_depth_is_that_of_mujocos_contacts(name: str, rng: np.random.Generator) 
 def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = str(POLICIES / "ant.pt")
     flags = f"--evaluate {path} --eval-episodes 2 --no-implicit --device cpu --run-dir {tmp_path}"
-    SCRIPTS["sapo"].main(flags.split())
+    SCRIPTS["rpo"].main(flags.split())
     returns, *table = capsys.readouterr().out.splitlines()
     parts = gait.Gait()
     with (tmp_path / "gait.csv").open() as file:
