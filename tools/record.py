@@ -1,7 +1,9 @@
 """Record a clip for humanoid_imitation: the cycle of a policy's motion that ends best where it begins.
 
-python tools/record.py diffsim/policies/humanoid.pt diffsim/assets/clips/humanoid_run.npz
+python tools/record.py diffsim/policies/humanoid.pt run.npz
 python tools/record.py runs/<run>/checkpoint.pt walk.npz --seconds 2
+
+humanoid_run.npz is of SHAC's seed 1, the humanoid that was shipped before RPO's.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Record examples/dog_trot.npz: the cycle of the shipped go2 policy's trot that ends closest to where it begins.
 
 python tools/record_trot.py
+
+The file in examples/ is of SHAC's seed 5, the go2 that was shipped before RPO's.
 """
 
 from __future__ import annotations
