@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from diffsim.kernels.lanes import Division
-from diffsim.kernels.records import PAIR_FIELDS, constraint_records
+from diffsim.kernels.records import PAIR_FIELDS, add_constraints
 from diffsim.kernels.spec import KernelSpec
 from diffsim.robot.drag import drag
 from diffsim.robot.scene import Scene
@@ -216,9 +216,8 @@ def scene_types(dtype: type, paired: bool) -> SimpleNamespace:
     arrays = {f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()}
     arrays |= {f"{name}ss": wp.array2d(dtype=kind) for name, kind in kinds.items()}
     fields = FIELDS | (PAIR_FIELDS if paired else {})
-    return SimpleNamespace(
-        **kinds, Model=struct("Model", {name: (kinds | arrays)[kind] for name, (kind, _) in fields.items()})
-    )
+    members = {name: (kinds | arrays)[kind] for name, (kind, _) in fields.items()}
+    return SimpleNamespace(**kinds, Model=struct("Model", members))
 
 
 @cache
@@ -344,10 +343,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
             "motor": T,  # force of the joint's motors
             "unclamped": T,  # 1 where the actuators' force is within its bounds
         }
-    own, more = constraint_records(spec, T, vec3, vec6, mat3, mat6)
-    structs |= own
-    for name, members in more.items():
-        structs[name] |= members
+    add_constraints(structs, spec, T, vec3, vec6, mat3, mat6)
     kinds |= {name: struct(name, members) for name, members in structs.items()}
     return SimpleNamespace(
         **kinds,
@@ -369,10 +365,8 @@ def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     """Put the scene's numbers into a Model on a device."""
     Model, entries = scene_types(dtype, scene.npairs > 0).Model, _Entries(scene, division)
     model = Model()
-    for name, (_, source) in (FIELDS | PAIR_FIELDS).items():
-        if name not in Model.vars:
-            continue
-        kind, values = Model.vars[name].type, source(entries)
+    for name, member in Model.vars.items():
+        kind, values = member.type, (FIELDS | PAIR_FIELDS)[name][1](entries)
         if isinstance(kind, wp.array) and values is not None:
             values = np.ascontiguousarray(values, np.int32 if kind.dtype is wp.int32 else float)
             # Warp gives an empty array no address; one unread element keeps the struct uniform.

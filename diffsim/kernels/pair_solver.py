@@ -25,6 +25,7 @@ import warp as wp
 
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.pair_geometry import pair_geometry
+from diffsim.kernels.solve import base_inertia
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 from diffsim.robot.pairs import JOINT
@@ -37,10 +38,10 @@ ROUND_OFF = 1e-6
 @cache
 def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     """Make the conjugate gradients on branches, the array of structs ("Motions" or "Nodes") that has T's factor."""
-    t, block, geometry = types(spec), blocks(spec), pair_geometry(spec)
+    t, block, geometry, base = types(spec), blocks(spec), pair_geometry(spec), base_inertia(spec)
     T, vec3, vec6, mat6, pick = t.T, t.vec3, t.vec6, t.mat6, block.pick
     Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
-    FLOATING, FIRST, ROOM = spec.floating, max(spec.spheres, 1), spec.room
+    FLOATING, FIRST, ROOM, PAIRS = spec.floating, max(spec.spheres, 1), spec.room, spec.pairs
     STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
 
     @wp.func
@@ -63,7 +64,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             branches[j].rate = branches[j].rate + f[0]
 
     @wp.func
-    def solve_cholesky(L: mat6, b: vec6):
+    def solve_factored(L: mat6, b: vec6):
         """Return I^-1 b by the base's Cholesky factor L."""
         a = b
         for r in range(6):
@@ -71,13 +72,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             for k in range(r):
                 y = y - L[r, k] * a[k]
             a[r] = y * L[r, r]
-        for rr in range(6):
-            r = 5 - rr
-            y = a[r]
-            for k in range(r + 1, 6):
-                y = y - L[k, r] * a[k]
-            a[r] = y * L[r, r]
-        return a
+        return base.back_substitute(L, a)
 
     @wp.func
     def solve_tree(m: Model, here: Lane, links: Links, branches: Branches, L: mat6):
@@ -91,7 +86,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             if wp.static(FLOATING) or p > 0:
                 branches[p].twist = branches[p].twist + own + branches[i].U * (u * branches[i].dinv)
         if wp.static(FLOATING):
-            branches[0].twist = solve_cholesky(L, -branches[0].twist)
+            branches[0].twist = solve_factored(L, -branches[0].twist)
         else:
             branches[0].twist = vec6()
         for i in range(1, here.n):
@@ -115,8 +110,8 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     ):
         """Solve H s = b where active is 1, given U s_0 as the blocks' rates: branches get s - s_0, blocks their y."""
         goal = T(0.0)
-        for k in range(here.listed):
-            s = contacts[FIRST + k].listed
+        pairs = int(PAIRS)  # not unrolled
+        for s in range(pairs):
             c = FIRST + s
             p = contacts[c].H * contacts[c].rate
             for r in range(3):
@@ -133,20 +128,17 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
         step = int(0)
         while step < STEPS and block.any_of(running):
             clear(branches)
-            for k in range(here.listed):
-                s = contacts[FIRST + k].listed
+            for s in range(pairs):
                 spread(m, s, contacts, contacts[FIRST + s].residual, branches)
             solve_tree(m, here, links, branches, L)
             pz = T(0.0)
-            for k in range(here.listed):
-                s = contacts[FIRST + k].listed
+            for s in range(pairs):
                 pz = pz + wp.dot(contacts[FIRST + s].residual, rates_of(m, s, contacts, branches))
             running = pick(enough, pz, running, T(0.0))
             beta = pick(T(0.0), last, pz / last, T(0.0))
             last = pz
             curvature = T(0.0)
-            for k in range(here.listed):
-                s = contacts[FIRST + k].listed
+            for s in range(pairs):
                 c = FIRST + s
                 q = contacts[c].residual + beta * contacts[c].direction
                 v = rates_of(m, s, contacts, branches) + beta * contacts[c].rate
@@ -157,8 +149,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             if step == 0:  # 1 / alpha is about the factor by which s_0's residual exceeds b
                 enough = accuracy * accuracy * alpha * alpha * pz
             left = T(0.0)
-            for k in range(here.listed):
-                s = contacts[FIRST + k].listed
+            for s in range(pairs):
                 c = FIRST + s
                 q = contacts[c].direction
                 contacts[c].change = contacts[c].change + alpha * q
@@ -168,8 +159,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             running = pick(goal, left, running, T(0.0))
             step = step + 1
         clear(branches)
-        for k in range(here.listed):
-            s = contacts[FIRST + k].listed
+        for s in range(pairs):
             spread(m, s, contacts, contacts[FIRST + s].change, branches)
         solve_tree(m, here, links, branches, L)
 

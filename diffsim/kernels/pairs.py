@@ -83,43 +83,38 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         return -(H * jar), H
 
     @wp.func
-    def velocity_of(m: Model, s: int, links: Links, contacts: Contacts):
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
-        return geometry.rates(m, s, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
+    def place(m: Model, s: int, links: Links, contacts: Contacts):
+        """Place a block; returns its violation and the state of its constraint."""
+        geometry.place(m, s, links, contacts)
+        r, norm = norm_of(m, s, links)
+        return r, equality_state(m, s, norm)
 
     @wp.func
     def begin(m: Model, here: Lane, links: Links, motions: Motions, origin: vec3, contacts: Contacts):
-        """Set up the blocks at the start of a substep, with zero acceleration; returns the number of active ones."""
+        """Set up the blocks at the start of a substep, with zero acceleration."""
         place_world(links, origin)
         motions[WORLD].accel_link = join(vec3(), -vec3(m.gravity))
-        count = int(0)
         pairs = int(PAIRS)
         for s in range(pairs):
             c = FIRST + s
-            geometry.place(m, s, links, contacts)
-            contacts[FIRST + count].listed = s
-            count = count + 1
-            r, norm = norm_of(m, s, links)
-            state = equality_state(m, s, norm)
-            velocity = velocity_of(m, s, links, contacts)
-            jar = T(m.row_params[s][1]) * velocity + state[2] * r
             i = m.row_link[2 * s]
             j = m.row_link[2 * s + 1]
+            r, state = place(m, s, links, contacts)
+            velocity = geometry.rates(m, s, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
+            jar = T(m.row_params[s][1]) * velocity + state[2] * r
             jar = jar + geometry.drift(m, s, links, contacts, motions[i].accel_link, motions[j].accel_link)
             f, H = law(m, s, state[0], jar)
             contacts[c].D = state[0]
             contacts[c].jar = jar
             contacts[c].f = f
             contacts[c].H = H
-        return count
 
     @wp.func
     def add_forces(m: Model, here: Lane, contacts: Contacts, motions: Motions, loads: Loads):
         """Add the iterate's forces to the links' loads, and those on joints to the joints' rate."""
         forward.clear(motions)
-        for k in range(here.listed):
-            s = contacts[FIRST + k].listed
+        pairs = int(PAIRS)
+        for s in range(pairs):
             forward.spread(m, s, contacts, contacts[FIRST + s].f, motions)
         for i in range(here.n):
             loads[i].f = loads[i].f + motions[i].twist
@@ -129,16 +124,16 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         m: Model, here: Lane, links: Links, contacts: Contacts, motions: Motions, root: Root, status: Newton
     ):
         """Turn the tree's Newton step into that with the rows between bodies."""
-        for k in range(here.listed):
-            s = contacts[FIRST + k].listed
+        pairs = int(PAIRS)
+        for s in range(pairs):
             i = m.row_link[2 * s]
             j = m.row_link[2 * s + 1]
             contacts[FIRST + s].rate = geometry.rates(
                 m, s, contacts, motions[i].A, motions[j].A, motions[i].u, motions[j].u
             )
         forward.solve(m, here, links, contacts, motions, root.L, status.active, T(ACCURACY))
-        for k in range(here.listed):
-            c = FIRST + contacts[FIRST + k].listed
+        for s in range(pairs):
+            c = FIRST + s
             contacts[c].Hs = -contacts[c].change
         motions[0].A = motions[0].A + motions[0].twist
         if wp.static(FLOATING):
@@ -153,8 +148,8 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     def trial(m: Model, here: Lane, motions: Motions, alpha: T, contacts: Contacts):
         """Evaluate the rows after the trial step alpha s; returns their part of newton.evaluate_trial."""
         total = vec6()
-        for k in range(here.listed):
-            s = contacts[FIRST + k].listed
+        pairs = int(PAIRS)
+        for s in range(pairs):
             c = FIRST + s
             i = m.row_link[2 * s]
             j = m.row_link[2 * s + 1]
@@ -180,8 +175,9 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def accept(here: Lane, contacts: Contacts):
         """Accept the last trial step."""
-        for k in range(here.listed):
-            c = FIRST + contacts[FIRST + k].listed
+        pairs = int(PAIRS)
+        for s in range(pairs):
+            c = FIRST + s
             contacts[c].jar = contacts[c].trial_jar
             contacts[c].f = contacts[c].trial_force
 
@@ -195,23 +191,17 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def recall(m: Model, here: Lane, links: Links, origin: vec3, ck: Ck, contacts: Contacts):
-        """Place the blocks as they were in a substep, with the jar that it ended with; returns the number of active."""
+        """Place the blocks as they were in a substep, with the jar that it ended with."""
         place_world(links, origin)
-        count = int(0)
         pairs = int(PAIRS)
         for s in range(pairs):
             c = FIRST + s
-            geometry.place(m, s, links, contacts)
-            contacts[FIRST + count].listed = s
-            count = count + 1
+            r, state = place(m, s, links, contacts)
             for axis in range(3):
                 contacts[c].jar[axis] = kin.load(ck.a, here.row, COLUMN + 3 * s + axis, here.e)
-            r, norm = norm_of(m, s, links)
-            state = equality_state(m, s, norm)
             f, H = law(m, s, state[0], contacts[c].jar)
             contacts[c].f = f
             contacts[c].H = H
-        return count
 
     @wp.func
     def lambda_rates(m: Model, s: int, contacts: Contacts, nodes: Nodes):
@@ -234,8 +224,8 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
                 for c in range(r + 1):
                     L[r, c] = kin.load(ck.f, row, k, here.e)
                     k = k + 1
-        for k in range(here.listed):
-            s = contacts[FIRST + k].listed
+        pairs = int(PAIRS)
+        for s in range(pairs):
             contacts[FIRST + s].rate = lambda_rates(m, s, contacts, nodes)
         backward.solve(m, here, links, contacts, nodes, L, T(1.0), T(ENOUGH))
         for i in range(here.n):
@@ -313,8 +303,8 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def add_adjoint(m: Model, here: Lane, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints):
         """Add the rows' part of phi, -f . rate under lambda, to the adjoints of links and joints."""
-        for k in range(here.listed):
-            s = contacts[FIRST + k].listed
+        pairs = int(PAIRS)
+        for s in range(pairs):
             c = FIRST + s
             i = m.row_link[2 * s]
             j = m.row_link[2 * s + 1]

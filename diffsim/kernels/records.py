@@ -23,14 +23,13 @@ PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
 }
 # Slots of the first and the second link; beside a floating base the world has one of its own
 PAIR_FIELDS["row_link"] = "ints", lambda n: np.where(n.scene.pairs.link < 0, n.scene.nlink, n.scene.pairs.link).flat
-Members = dict[str, dict[str, Any]]  # of each struct, its members and their types
 
 
-def constraint_records(
-    spec: KernelSpec, T: type, vec3: type, vec6: type, mat3: type, mat6: type
-) -> tuple[Members, Members]:
-    """Return the constraints' own structs, and members that others have with them."""
-    structs: Members = {
+def add_constraints(
+    structs: dict[str, dict[str, Any]], spec: KernelSpec, T: type, vec3: type, vec6: type, mat3: type, mat6: type
+) -> None:
+    """Add the constraints' own structs, and the members that other ones have with them, by their names and types."""
+    structs |= {
         # Newton's method of an environment
         "Newton": {
             "tolerance": T,  # of the residual
@@ -54,14 +53,13 @@ def constraint_records(
     }
     if spec.framed or spec.pairs:
         structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
-    members: Members = {"Node": {}, "Adjoint": {}, "Motion": {}, "Root": {}, "Lane": {}}
     if spec.constrained:
-        members["Node"] |= {
+        structs["Node"] |= {
             "B": vec6,  # sum of S qacc, the twist that gives J a (constraint.py)
             "qacc": T,  # the joint's acceleration before damping
         }
-        members["Adjoint"] |= {"b": vec6}  # B
-        members["Motion"] |= {
+        structs["Adjoint"] |= {"b": vec6}  # B
+        structs["Motion"] |= {
             "accel_link": vec6,  # acceleration of the link, of Newton's iterate
             "limit": vec3,  # the limit's row, see constraint.limit_state
             "accel_joint": T,  # acceleration of the joint, of Newton's iterate
@@ -72,11 +70,11 @@ def constraint_records(
             "trial_slope": T,  # con_slope after the trial step
         }
     if spec.damped:
-        members["Node"] |= {
+        structs["Node"] |= {
             "D": vec6,  # what damping adds to B
             "W1": vec6,  # twist under lambda of the damped solve
         }
-        members["Adjoint"] |= {
+        structs["Adjoint"] |= {
             "d": vec6,  # D
             "w1": vec6,  # W1
         }
@@ -89,14 +87,11 @@ def constraint_records(
             "direction": vec3,  # of their search, as such forces
             "rate": vec3,  # acceleration of the rows by the direction
             "change": vec3,  # of the forces, by the step
-            "listed": int,  # number of the k-th block that is active, in element k
         }
         work = {
             "twist": vec6,  # of the link, by the forces of rows between bodies; in the inward sweep the bias force
             "rate": T,  # of its joint
         }
-        members["Motion"] |= work
-        members["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
-        members["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia
-        members["Lane"] |= {"listed": int}  # number of blocks that are active
-    return structs, members
+        structs["Motion"] |= work
+        structs["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
+        structs["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia

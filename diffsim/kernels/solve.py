@@ -27,6 +27,17 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
     BASE = 7 * (spec.nlink - 1)  # first column of the base's factor, packed by rows
 
     @wp.func
+    def back_substitute(L: mat6, b: vec6):
+        a = b
+        for rr in range(6):
+            r = 5 - rr
+            y = a[r]
+            for k in range(r + 1, 6):
+                y = y - L[k, r] * a[k]
+            a[r] = y * L[r, r]
+        return a
+
+    @wp.func
     def factor_base(Ia: mat3, Ib: mat3, Id: mat3, b: vec6):
         """Return the Cholesky factor (reciprocal diagonal) of the base's articulated inertia I, and I^-1 b."""
         L = mat6()
@@ -49,13 +60,7 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
                 y = y - L[r, k] * a[k]
             L[r, r] = T(1.0) / wp.sqrt(s)
             a[r] = y * L[r, r]
-        for rr in range(6):
-            r = 5 - rr
-            y = a[r]
-            for k in range(r + 1, 6):
-                y = y - L[k, r] * a[k]
-            a[r] = y * L[r, r]
-        return L, a
+        return L, back_substitute(L, a)
 
     @wp.func
     def store_base(ck_f: t.array3, row: int, e: int, L: mat6):
