@@ -275,7 +275,7 @@ def iteration(device: str, name: str, learner: str, num_envs: int, horizon: int,
     graph.release()
     gc.collect()
     usual = median(times[len(times) // 4 :])
-    return {"ms": 1e3 * usual, "launches": Measured.launches, "start (s)": seconds - sum(times[1:])}
+    return {"ms": 1e3 * usual, "launches": Measured.launches or "", "start (s)": seconds - sum(times[1:])}
 
 
 def shown_iterations(rows: Sequence[Mapping[str, str]]) -> list[Row]:
