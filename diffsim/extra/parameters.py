@@ -28,7 +28,7 @@ from diffsim.kernels.lanes import divide
 from diffsim.kernels.model import model_of
 from diffsim.robot.constraint import LEAST_FRICTION, constrained
 from diffsim.robot.contact import declared_pairs, ground_pairs, pair_law
-from diffsim.robot.elements import at_rest, control_range, motors, servos
+from diffsim.robot.elements import at_rest, control_range, label, motors, servos
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration
@@ -272,6 +272,22 @@ class ParametricSimulator(Simulator):
     def adjustable(self, name: str) -> Tensor:
         """Mark the elements of a parameter that may differ from the file's: those that the motion depends on."""
         return self._robot.adjustable(name).clone()
+
+    def elements(self, name: str) -> list[str]:
+        """Return the names of the bodies, geoms, actuators or joints that the rows of a parameter belong to."""
+        m, kind = self._robot.m, FIELDS[name][0].split("_")[0].replace("dof", "joint")
+        rows = m.dof_jntid.tolist() if kind == "joint" else range(len(self._robot.file[name]))
+        return [label(m, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k).replace("'", "") for k in rows]
+
+    def jacobian(self, outputs: Tensor, x: Tensor) -> Tensor:
+        """Compute derivatives (N, k, n) of each environment's outputs (N, k) in x (n,), by k backward passes.
+
+        The parameters in use are a function of x. The outputs depend on them by the steps of this window alone.
+        """
+        rows = [torch.autograd.grad(y.sum(), self._factors, retain_graph=True)[0] for y in outputs.unbind(1)]
+        row, each = self._factors[0], torch.eye(self._robot.count).to(self._factors)
+        (of_columns,) = torch.autograd.grad(row, x, each, retain_graph=True, is_grads_batched=True)
+        return torch.stack(rows, dim=1) @ of_columns.to(row)
 
     def mj_model(self) -> mujoco.MjModel:
         """Return a copy of the file's model with the parameters."""

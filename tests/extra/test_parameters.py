@@ -34,6 +34,7 @@ from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
+from diffsim.tasks.base import ASSETS
 
 HARD, SOFT, IMPLICIT = Integration("mujoco", 3, tolerance=1e-12), Integration("soft", 8), Integration("soft", 8, True)
 Values = dict[str, Any]
@@ -207,6 +208,37 @@ def test_gradients_of_blocks_are_those_of_single_robots() -> None:
     for name, value, expected in zip(FIELDS, *grads, strict=True):
         assert (value - expected).norm() <= 1e-3 * expected.norm(), name
         assert expected.norm() > 0 or name == "kv"
+
+
+def test_jacobian_has_each_robots_derivatives() -> None:
+    """Of two outputs after two steps, in two factors of all masses and of all dampings."""
+    scene, states = bounded_servos("Euler")
+
+    def outputs(rows: slice, x: Tensor) -> tuple[ParametricSimulator, Tensor]:
+        q, v, u = (torch.tensor(part[rows]) for part in states)
+        sim = ParametricSimulator(scene, len(q), HARD, 3 * H, 2, dtype=torch.float64)
+        sim.parameters = {name: x[k] * sim.parameters[name] for k, name in enumerate(("mass", "damping"))}
+        for _ in range(2):
+            q, v = sim.step(q, v, u)
+        return sim, torch.stack((q.sin().sum(1), v.sin().sum(1)), 1)
+
+    x = torch.tensor([1.1, 0.9], dtype=torch.float64, requires_grad=True)
+    sim, y = outputs(slice(None), x)
+    jacobian = sim.jacobian(y, x)
+    assert jacobian.shape == (8, 2, 2)
+    for k in range(3):
+        _, y = outputs(slice(k, k + 1), x)
+        expected = torch.stack([torch.autograd.grad(value, x, retain_graph=True)[0] for value in y[0]])
+        torch.testing.assert_close(jacobian[k], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_elements_and_which_of_them_may_differ() -> None:
+    sim = ParametricSimulator(load_scene(ASSETS / "go2.xml"), 1, HARD)
+    assert sim.elements("mass")[:3] == ["world", "base", "FL_hip"] and not sim.adjustable("mass")[0]
+    assert sim.elements("damping")[5:7] == ["root", "FL_hip_joint"]
+    assert sim.adjustable("damping").tolist() == [False] * 6 + [True] * 12
+    rough = [name for name, free in zip(sim.elements("friction"), sim.adjustable("friction"), strict=True) if free]
+    assert rough == ["FL", "FR", "RL", "RR"]
 
 
 def test_parameters_change_between_windows_only() -> None:
