@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 import tyro
 import worlds
-from common import CommonFlags, Tasks, run
+from common import CommonFlags, Tasks, check_names, run
 from tables import ROOT, grouped, markdown, numbers
 from torch import Tensor
 
@@ -29,7 +30,7 @@ from diffsim import Scene, load_scene
 from diffsim.extra.parameters import ParametricSimulator
 from diffsim.robot.elements import control_range
 from diffsim.tasks.base import ASSETS
-from diffsim.training import load_policy
+from diffsim.training import fail, load_policy
 from diffsim.training.checkpoint import POLICIES
 
 sys.path.append(str(ROOT / "examples"))
@@ -37,6 +38,7 @@ import identify  # noqa: E402
 
 SECONDS, DT, EPISODES, NOISE = 5.0, 0.02, 8, 1e-3
 CHANGE = 0.4  # standard deviation of the true values, as a part of the prior's
+CASES = "load", "arm", "go2"
 
 
 class Case(NamedTuple):
@@ -51,7 +53,7 @@ class Case(NamedTuple):
 @dataclass
 class Args(CommonFlags):
     folder: tyro.conf.Positional[Path] = Path()  # a clone of MuJoCo Menagerie
-    cases: tuple[str, ...] = ("load", "arm", "go2")
+    cases: tuple[str, ...] = CASES
     env: tyro.conf.Suppress[Tasks] = ()
     draw_only: tyro.conf.Suppress[bool] = False  # there is nothing to draw
 
@@ -118,14 +120,18 @@ def measure(name: str, case: Case, log: Path) -> list[dict[str, object]]:
 
 
 def main(args: Args) -> None:
-    args.directory.mkdir(parents=True, exist_ok=True)
+    check_names("--cases", args.cases, CASES)
     for name in args.cases:
-        args.replace("identify", measure(name, args.case(name), args.directory / f"identify_{name}.log"), ("case",))
+        case = args.case(name)
+        if not case.file.is_file():
+            fail(f"no such file: {case.file}; MuJoCo Menagerie is at github.com/google-deepmind/mujoco_menagerie")
+        with TemporaryDirectory() as folder:
+            args.replace("identify", measure(name, case, Path(folder) / "log.csv"), ("case",))
     summary = []
-    for (case, parameter), rows in grouped(args.read("identify"), "case", "parameter").items():
+    for (name, parameter), rows in grouped(args.read("identify"), "case", "parameter").items():
         before, after = (f"{median(numbers(rows, column)):.2g}" for column in ("file's error", "error"))
         known = sum(deviation < identify.KNOWN for deviation in numbers(rows, "deviation"))
-        summary.append({"case": case, "parameter": parameter, "numbers": len(rows), "known alone": known})
+        summary.append({"case": name, "parameter": parameter, "numbers": len(rows), "known alone": known})
         summary[-1] |= {"median error of the file": before, "of the fit": after}
     args.publish("identify", markdown(summary), "")
 
