@@ -67,7 +67,7 @@ class _Robot:
         self.scene, self.hard, self.first = scene, hard, 6 if scene.floating else 0
         self.m = m = scene.mj_model
         self.file = {name: torch.tensor(getattr(m, field)[place]).double() for name, (field, place) in FIELDS.items()}
-        self.file["kv"] *= -1.0
+        self.file["kv"] = 0.0 - self.file["kv"]
         moving = scene.body_link > (-1 if scene.floating else 0)
         self.bodies = torch.tensor(np.flatnonzero(moving))
         # Servos whose kp, whose kv is their gain
@@ -76,10 +76,10 @@ class _Robot:
         self._read_bodies()
         self._read_actuators()
         self._read_contacts()
-        dofs, rubbing = np.arange(m.nv) >= self.first, np.zeros(m.ngeom, bool)
-        rubbing[self.rubs[self.rough]] = True
+        dofs, rough = np.arange(m.nv) >= self.first, np.zeros(m.ngeom, bool)
+        rough[self.friction_geoms[self.has_friction]] = True
         self.free: dict[str, Mask] = dict.fromkeys(("mass", "com", "inertia"), moving)
-        self.free |= {"friction": rubbing, "damping": dofs, "armature": dofs, "frictionloss": dofs & hard}
+        self.free |= {"friction": rough, "damping": dofs, "armature": dofs, "frictionloss": dofs & hard}
         self.free |= {"gain": motors(m) | servos(m), "kv": servos(m) & ~self.tied[1]}
         with torch.no_grad():
             self.count = len(self.columns(self.file))
@@ -114,25 +114,26 @@ class _Robot:
         axis = np.abs(m.actuator_gear[:, :3]).argmax(1) * (self.scene.ball[self.scene.motor_link] >= 0)
         gear = m.actuator_gear[np.arange(m.nu), axis]
         self.gear = torch.tensor(np.stack((gear * (high - low) / 2, gear * (high + low) / 2), 1))
-        self.stiffens, self.dampens = (torch.tensor(gear**2 * tied) for tied in self.tied)
-        self.brakes = torch.tensor(gear**2 * (servos(m) & ~self.tied[1]))
+        self.stiffness_of_gain, self.damping_of_gain = (torch.tensor(gear**2 * tied) for tied in self.tied)
+        self.damping_of_kv = torch.tensor(gear**2 * (servos(m) & ~self.tied[1]))
 
     def _read_contacts(self) -> None:
         """Read the contacts in the kernels' order."""
         m, spheres = self.m, self.scene.spheres
         geoms = spheres.geom[np.argsort(spheres.link, kind="stable")].tolist() if self.hard else []
         ground = ground_pairs(m)[0][0] if geoms else 0
-        rubs, rough = np.zeros((len(geoms), 2), int), np.zeros(len(geoms), bool)
+        pairs, has_friction = np.zeros((len(geoms), 2), int), np.zeros(len(geoms), bool)
         for k, geom in enumerate(geoms):
-            rough[k] = pair_law(m, ground, geom).condim > 1 and tuple(sorted((ground, geom))) not in declared_pairs(m)
+            declared = tuple(sorted((ground, geom))) in declared_pairs(m)  # with a friction of its own
+            has_friction[k] = not declared and pair_law(m, ground, geom).condim > 1
             ahead = int(np.sign(m.geom_priority[geom] - m.geom_priority[ground]))
-            rubs[k] = (ground if ahead <= 0 else geom), (geom if ahead >= 0 else ground)
-        # The geoms whose larger friction a contact has; whether it has any of them
-        self.rubs, self.rough = torch.tensor(rubs), torch.tensor(rough)
+            pairs[k] = (ground if ahead <= 0 else geom), (geom if ahead >= 0 else ground)
+        # The geoms whose larger friction a contact has
+        self.friction_geoms, self.has_friction = torch.tensor(pairs), torch.tensor(has_friction)
         self.contact_body = torch.tensor(m.geom_bodyid[geoms]).long()
 
     def _about(self, turn: Tensor, place: Tensor, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the bodies' centres of mass and moments of inertia in and about frames, in which they stand so."""
+        """Return the bodies' centres of mass and moments of inertia in frames where they have these poses."""
         mass, com, moments = (values[name][self.bodies] for name in ("mass", "com", "inertia"))
         axes, at = turn @ self.axes, place + (turn @ com[:, :, None])[:, :, 0]
         around = torch.eye(3).to(at) * at.square().sum(1)[:, None, None] - at[:, :, None] * at[:, None, :]
@@ -146,7 +147,9 @@ class _Robot:
         links = ten.new_zeros(nlink, columns.LINK).index_add(0, self.link, ten)
         weight, contacts = self._logs_of_weights(values) if self.hard else (0 * values["armature"], links[:0, :2])
         of_dofs = torch.stack((values["armature"], values["damping"], values["frictionloss"], weight))[:, self.first :]
-        servo = torch.stack((self.stiffens * drive, self.dampens * drive + self.brakes * values["kv"]))
+        servo = torch.stack(
+            (self.stiffness_of_gain * drive, self.damping_of_gain * drive + self.damping_of_kv * values["kv"])
+        )
         of_servos = ten.new_zeros(2, nlink).index_add(1, self.motor_link, servo)[:, 1:]
         joints = torch.nn.functional.pad(torch.cat((of_dofs, of_servos)), (1, 0)).mT
         return torch.cat([x.flatten() for x in (links, joints, self.gear * drive[:, None], contacts)])
@@ -160,7 +163,7 @@ class _Robot:
         matrix = (turning.mT @ inertia @ turning + mass * (moving.mT @ moving)).sum(0) + values["armature"].diag()
         inverse = torch.linalg.inv(matrix)
         of_bodies = torch.ones(self.m.nbody).to(at).index_put((self.bodies,), (moving @ inverse * moving).sum((1, 2)))
-        friction = values["friction"][self.rubs].amax(1).clamp(min=LEAST_FRICTION) * self.rough
+        friction = values["friction"][self.friction_geoms].amax(1).clamp(min=LEAST_FRICTION) * self.has_friction
         return (self.mean @ inverse.diagonal()).log(), torch.stack((friction, of_bodies[self.contact_body].log()), 1)
 
     def model(self, values: dict[str, Tensor]) -> mujoco.MjModel:
@@ -208,11 +211,11 @@ class ParametricSimulator(Simulator):
     """A Simulator whose steps are differentiable in the robot's constants, which are the same in all environments.
 
     Args:
-        scene: without fluid, gravity compensation, tendons and equality constraints.
+        scene: without fluid, gravity compensation, tendons and constraints between bodies.
         num_envs: as for Simulator, like the rest.
         integration: contact model and substeps.
         *args: control_dt and horizon.
-        **options: those of Simulator without factors and division.
+        **options: those of Simulator without factors, forces and division.
 
     Raises:
         SceneError: the robot has one of these.
@@ -221,20 +224,20 @@ class ParametricSimulator(Simulator):
     def __init__(
         self, scene: Scene, num_envs: int, integration: Integration = Integration(), *args: Any, **options: Any
     ) -> None:
-        if taken := {"factors", "division"} & options.keys():
+        if taken := {"factors", "forces", "division"} & options.keys():
             raise ValueError(f"a ParametricSimulator has no option {', '.join(sorted(taken))}")
-        found = [what for feature, what in UNSUPPORTED.items() if feature in scene.features]
-        found += ["equality constraints"] * bool(scene.mj_model.eq_active0.any())
-        if found:
+        if found := [what for feature, what in UNSUPPORTED.items() if feature in scene.features]:
             raise SceneError(f"{scene.name}: parameters are not supported with {', '.join(found)}")
         self._robot = _Robot(scene, hard=integration.contact == "mujoco")
         scene = dataclasses.replace(scene, parameters=self._robot.count)
         super().__init__(scene, num_envs, integration, *args, division=(1, 1), **options)
+        if self._launcher.spec.pairs:
+            raise SceneError(f"{scene.name}: parameters are not supported with constraints between bodies")
         self.parameters = {}
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """Return the parameters by name, in float64 on the CPU: those assigned, and copies of the file's.
+        """Return copies of the parameters by name, in float64 on the CPU: those assigned, else the file's.
 
         They are MuJoCo's body_mass, body_ipos (com), body_inertia, geom_friction[:, 0], dof_damping, dof_armature,
         dof_frictionloss, actuator_gainprm[:, 0] (gain) and -actuator_biasprm[:, 2] (kv). The gain of a position servo
@@ -244,7 +247,7 @@ class ParametricSimulator(Simulator):
             ValueError: an unknown name, another shape, or a number that no robot can have.
             RuntimeError: after a differentiable step of the window.
         """
-        return {name: value.clone() for name, value in self._robot.file.items()} | self._given
+        return {name: value.detach().clone() for name, value in (self._robot.file | self._given).items()}
 
     @parameters.setter
     def parameters(self, values: Mapping[str, Tensor]) -> None:

@@ -286,7 +286,13 @@ def test_what_no_robot_has_is_refused_in_one_line() -> None:
             sim.parameters = {name: value}
     with pytest.raises(ValueError, match="has no option factors"):
         ParametricSimulator(scene, 1, HARD, factors=True)
-    for file, what in ((FISH, "a fluid"), (COMPENSATED, "gravity compensation"), (CRANE, "tendons")):
+    coupled = FREE_SERVOS.replace("<actuator>", '<equality> <joint joint1="a" joint2="b"/> </equality> <actuator>')
+    for file, what in (
+        (FISH, "a fluid"),
+        (COMPENSATED, "gravity compensation"),
+        (CRANE, "tendons"),
+        (coupled, "constraints between bodies"),
+    ):
         with pytest.raises(SceneError, match=f"robot: parameters are not supported with {what}"):
             ParametricSimulator(parse(file), 1, HARD)
 
