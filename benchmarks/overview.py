@@ -42,7 +42,7 @@ def lines(machine: str) -> dict[tuple[str, str], Row]:
         seeds = own.get((task, learner), [])
         if len(seeds) > 2 and len({row["trained on"] for row in seeds}) == 1:
             total = next((row["in all (s)"] for row in seeds if row["seed"] == "1"), "")
-            shown: Row = {**paper.line(seeds), "in all (s)": total, "on": ""}
+            shown: Row = {**paper.line(seeds), "in all (s)": f"{float(total):.0f}" if total else ""}
             found[task, learner] = {**shown, "training (s)": paper.seconds(shown)}
     return found
 
