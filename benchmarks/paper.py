@@ -1,4 +1,4 @@
-"""The results of docs/benchmarks.md and docs/experiments.md as one list of cells: a learner on a task with a seed, trained to its end, alone.
+"""The paper's results as one list of cells: a learner on a task with a seed, trained to its end, alone.
 
     python benchmarks/paper.py --check                             what is missing
     python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables

@@ -18,7 +18,7 @@ and `TaskError` are `ValueError`s.
 NAMES = "make DiffEnv Simulator Integration Task load_scene".split()
 FULL = "step reset detach set_state jacobians".split()  # methods of DiffEnv and Simulator, printed with all they say
 # Methods that few programs need
-INTERNAL = """pin_window write_back take_statistics advance check_tensor tangent check load_robot scene bind presets
+INTERNAL = """pin_rollout write_back take_statistics advance check_tensor tangent check load_robot scene bind presets
 integration falls has_mirror configured terrain stored restored over ghost disturb observe_with""".split()
 
 
