@@ -161,6 +161,8 @@ def shown(rows: list[dict[str, str]]) -> list[Row]:
     hard = [row for row in rows if row["ground"] == "mujoco"]
     for (task, learner), own in grouped(hard, "task", "learner").items():
         sure = [row for row in own if float(row["differences"]) > AGREE and float(row.get("chance") or 0) < CHANCE]
+        if not sure:
+            continue
         cosines = {int(row["horizon"]): row["cosine"] for row in sure}
         ratios = {int(row["horizon"]): row.get("ratio", "") for row in sure}
         line = {f"cosine, {k} steps": cosines.get(k, "") for k in ROLLOUTS}

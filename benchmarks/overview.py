@@ -16,7 +16,7 @@ import cells
 import common
 import numpy as np
 import paper
-from cells import LEARNERS, RETURNS, Curve
+from cells import RETURNS, Curve
 from common import LEARNT, Line, Panel, plot, run
 from tables import Row, grouped, markdown, read_csv
 
@@ -117,20 +117,11 @@ def races() -> Iterator[Panel]:
         yield Panel(drawn, task, "seconds of training", y, "xy" if column == "error" else "x")
 
 
-def commands() -> list[Row]:
-    """The flags of learners that are a script with some."""
-    found = {learner: LEARNERS[learner].partition(" ") for learner in SHOWN}
-    return [
-        {"learner": name, "command": f"`{script}.py {flags}`"} for name, (script, _, flags) in found.items() if flags
-    ]
-
-
 def main(args: Args) -> None:
     on_gpu = gpu()
     args.publish("why", markdown([*compared(on_gpu)]), README)
     args.publish("gpu", markdown([*on_gpu.values()], COLUMNS), PAGE)
     args.publish("cpu", markdown([*lines("cpu").values()], COLUMNS), PAGE)
-    args.publish("commands", markdown(commands()), PAGE)
     grid = [*panels(GPUS), *races()]
     plot(args.picture("benchmarks"), [grid], (3.4, 2.6))
     plot(args.picture("benchmarks_cpu"), [panels(("cpu",))], (3.4, 2.6))
