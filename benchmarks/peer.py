@@ -175,7 +175,7 @@ TRAIN = "task", "seed", "control steps", "training (s)", "control steps/s", "ret
 
 PARTS = {
     "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", columns=SPEED),
-    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", columns=TRAIN),
+    "train": Part("peer_train", train, ("task", "seed"), columns=TRAIN),
 }
 
 
