@@ -26,7 +26,11 @@ GPUS = "h200", "h100"  # of a learner with results on both the first one counts
 SHOWN = "rpo shac sapo ppo_4096 ppo_baseline bptt sac_baseline sac_large redq redq_500 mbpo se_mbpo".split()
 COLUMNS = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")
 MAIN = {"rpo": "RPO", "shac": "SHAC", "ppo_4096": "PPO"}  # in the README
-RACES = ("joystick_race", "error", "go2", "error (m/s)"), ("tracking_race", "success", "g1_track", "success")
+RACES = (
+    ("joystick_race", "error", "go2", "error (m/s)"),
+    ("joystick_race", "error", "g1", "error (m/s)"),
+    ("tracking_race", "success", "g1_track", "success"),
+)
 
 
 @dataclass
@@ -108,7 +112,7 @@ def races() -> Iterator[Panel]:
     """What MuJoCo says of checkpoints along trainings: each seed."""
     for file, column, task, y in RACES:
         rows, drawn = read_csv(common.RESULTS / "cpu" / f"{file}.csv"), list[Line]()
-        rows = [row for row in rows if "_shared/" not in row["checkpoint"]]
+        rows = [row for row in rows if row["task"] == task and "_shared/" not in row["checkpoint"]]
         for (learner, _), own in grouped(rows, "learner", "seed").items():
             own.sort(key=lambda row: float(row["training s"]))
             script = "ppo_4096" if learner.startswith("ppo") else learner.partition(" ")[0]
