@@ -210,15 +210,20 @@ def gaits(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def race(rows: list[dict[str, str]]) -> list[Row]:
-    """Seconds of training to an error, from checkpoints along the way: a line for each task, learner and seed."""
+    """Seconds of training to an error, from checkpoints along the way: a line for each task and learner, with all
+    seeds."""
     lines = list[Row]()
-    for (task, learner, seed), group in grouped(rows, "task", "learner", "seed").items():
-        group.sort(key=lambda row: float(row["training s"]))
-        line: dict[str, object] = {"task": task, "learner": learner, "seed": seed}
-        for most in RACE:
-            reached = (row["training s"] for row in group if float(row["error"]) <= most and float(row["whole"]) == 1)
-            line[f"s to {most:g} m/s"] = next(reached, "")
-        lines.append(line | {"in all (s)": group[-1]["training s"], "last error (m/s)": group[-1]["error"]})
+    for (task, learner), seeds in grouped(rows, "task", "learner").items():
+        columns = dict[str, list[str]]()
+        for group in grouped(seeds, "seed").values():
+            group.sort(key=lambda row: float(row["training s"]))
+            for most in RACE:
+                good = (row["training s"] for row in group if float(row["error"]) <= most and float(row["whole"]) == 1)
+                columns.setdefault(f"s to {most:g} m/s", []).append(next(good, "never"))
+            columns.setdefault("in all (s)", []).append(group[-1]["training s"])
+            columns.setdefault("last error (m/s)", []).append(group[-1]["error"])
+        line = {name: ", ".join(cells) for name, cells in columns.items()}
+        lines.append({"task": task, "learner": learner.partition(" ")[0]} | line)
     return lines
 
 

@@ -129,7 +129,7 @@ def test_landscape(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         module.measure(module.Args(points=points, trajectories=3), tiny_run / "checkpoint.pt") for points in (3, 5)
     )
     assert few == many[::2] and [row["change"] for row in few] == [-1.0, 0.0, 1.0]
-    assert all(len({row[loss] for row in many}) == 5 for loss in ("long", "window"))
+    assert all(len({row[loss] for row in many}) == 5 for loss in ("long", "rollout"))
     assert module.lowest([3.0, 1.0, 2.0, 0.0, 5.0]) == [0, 1, 0, 1, 0]
     module.main(module.Args(checkpoints=(tiny_run,), points=3, trajectories=3, output=tmp_path))
     assert len(tables.read_csv(tmp_path / "landscape.csv")) == 3 and (tmp_path / "landscape.png").is_file()
