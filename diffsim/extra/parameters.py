@@ -241,18 +241,18 @@ class ParametricSimulator(Simulator):
 
         They are MuJoCo's body_mass, body_ipos (com), body_inertia, geom_friction[:, 0], dof_damping, dof_armature,
         dof_frictionloss, actuator_gainprm[:, 0] (gain) and -actuator_biasprm[:, 2] (kv). The gain of a position servo
-        is also its kp. Assign a dictionary with some of them at the start of a window: a simulator's or its rewind().
+        is also its kp. Assign a dictionary with some of them at the start of a rollout: a simulator's or its rewind().
 
         Raises:
             ValueError: an unknown name, another shape, or a number that no robot can have.
-            RuntimeError: after a differentiable step of the window.
+            RuntimeError: after a differentiable step of the rollout.
         """
         return {name: value.detach().clone() for name, value in (self._robot.file | self._given).items()}
 
     @parameters.setter
     def parameters(self, values: Mapping[str, Tensor]) -> None:
         if self._slot:
-            raise RuntimeError("parameters cannot change within a window of differentiable steps: call rewind() before")
+            raise RuntimeError("parameters cannot change within a rollout: call rewind() before")
         given = {name: self._robot.check(name, value) for name, value in values.items()}
         new, scene, launcher = load_scene(self._robot.model(self._robot.file | given)), self.scene, self._launcher
         scene = dataclasses.replace(scene, mj_model=new.mj_model, **{name: getattr(new, name) for name in OF_SCENE})
@@ -285,7 +285,7 @@ class ParametricSimulator(Simulator):
     def jacobian(self, outputs: Tensor, x: Tensor) -> Tensor:
         """Compute derivatives (N, k, n) of each environment's outputs (N, k) in x (n,), by k backward passes.
 
-        The parameters in use are a function of x. The outputs depend on them by the steps of this window alone.
+        The parameters in use are a function of x. The outputs depend on them by the steps of this rollout alone.
         """
         rows = [torch.autograd.grad(y.sum(), self._factors, retain_graph=True)[0] for y in outputs.unbind(1)]
         row, each = self._factors[0], torch.eye(self._robot.count).to(self._factors)

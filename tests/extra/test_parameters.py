@@ -246,7 +246,7 @@ def test_parameters_change_between_windows_only() -> None:
     start = [torch.tensor(x) for x in states]
     sim.parameters = {"mass": (mass := sim.parameters["mass"].requires_grad_())}
     _, qvel = sim.step(*start)
-    with pytest.raises(RuntimeError, match=r"within a window.*rewind\(\)"):
+    with pytest.raises(RuntimeError, match=r"within a rollout.*rewind\(\)"):
         sim.parameters = {}
     sim.rewind()
     sim.parameters = {"mass": 1.1 * mass.detach()}
