@@ -83,7 +83,7 @@ class Simulator:
         self.device = torch.device(self.options.device)
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
         n, how, hard = num_envs, self.integration, self.integration.contact == "mujoco"
-        width, bodies = len(FACTORS) if self.options.factors else 0, scene.nbody if self.options.forces else 0
+        width, bodies = scene.parameters or len(FACTORS) * self.options.factors, scene.nbody * self.options.forces
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
