@@ -189,26 +189,6 @@ def whole(rows: list[dict[str, str]]) -> list[Row]:
     ]
 
 
-GAIT: dict[str, tuple[str, Callable[[Sequence[float]], float]]] = {
-    "left-right": (".2f", max),
-    "diagonal": (".2f", max),
-    "clearance (m)": (".3f", min),
-    "slip (m/s)": (".2f", max),
-    "action change": (".0%", max),
-    "saturated": (".0%", max),
-    "cost of transport": (".2f", max),
-}
-
-
-def gaits(rows: list[dict[str, str]]) -> list[Row]:
-    """Gaits in the file's world: a line for each number, a column for each task, learner and machine."""
-    plain = {policy: undisturbed(group) for policy, group in policies(rows).items()}
-    return [
-        {"gait": name} | {policy: with_worst(own, name, *how) for policy, own in plain.items()}
-        for name, how in GAIT.items()
-    ]
-
-
 def race(rows: list[dict[str, str]]) -> list[Row]:
     """Seconds of training to an error, from checkpoints along the way: a line for each task and learner, with all
     seeds."""
@@ -252,7 +232,6 @@ def main(args: Args) -> None:
         return
     rows = measured(args, Part("joystick", measure, key, "joystick", PAGE, table))
     args.publish("whole", tables.markdown(whole(rows)), PAGE)
-    print(tables.markdown(gaits(rows)))
 
 
 if __name__ == "__main__":

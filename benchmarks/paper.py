@@ -238,7 +238,7 @@ def seconds(row: Row) -> str:
 
 
 def printed(args: Args, name: str) -> str:
-    """A group's table: a line for each learner and task or, without seconds, for each task.
+    """A group's table: a line for each learner and task, or for each task the ratio of two learners.
 
     A task that has a single learner is left out: it compares nothing.
     """
@@ -246,15 +246,7 @@ def printed(args: Args, name: str) -> str:
         return markdown(ratios(args, name))
     rows = table(args, name)
     count = Counter(row["task"] for row in rows)
-    rows = [{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1]
-    if GROUPS[name].timed:
-        return markdown(rows, TIMED)
-    lines = dict[object, dict[str, object]]()
-    for row in rows:
-        of_task = lines.setdefault(row["task"], {"task": row["task"]})
-        of_task[str(row["learner"])] = f"{row['return']}<br>{row['steps to target']}"
-    columns = [learner for learner in GROUPS[name].learners if any(learner in each for each in lines.values())]
-    return markdown([*lines.values()], ("task", *columns))
+    return markdown([{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1], TIMED)
 
 
 def check(args: Args) -> str:
