@@ -7,21 +7,19 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from diffsim.extra.gait import trace
 from diffsim.extra.own_task import start_control
 from diffsim.robot.contact import (
     HULL_POINTS,
     base_geoms,
-    collide,
     contact_points,
-    declared_pairs,
     ground_pairs,
     hull,
     pair_law,
 )
-from diffsim.robot.elements import control_range, disabled_flags, label, listed, motors
+from diffsim.robot.elements import control_range, label, listed, motors
+from diffsim.robot.pairs import self_pairs
 from diffsim.robot.scene import Scene
 
 Kind, Geom, Integrator = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtIntegrator
@@ -81,33 +79,15 @@ def _bodies(scene: Scene) -> Iterator[str]:
         yield f"Mocap bodies stay where the file has them: {names}."
 
 
-def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield the robot's geoms, each with the later ones of other bodies that it may touch."""
-    weld = m.body_weldid[m.geom_bodyid]
-    parent = m.body_weldid[m.body_parentid[weld]]
-    filters = "filterparent" not in disabled_flags(m)
-    parts = np.flatnonzero((weld > 0) | base_geoms(m))
-    declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
-    for k, a in enumerate(parts.tolist()):
-        b = parts[k + 1 :]
-        related = ((parent[a] == weld[b]) | (parent[b] == weld[a])) & (weld[a] > 0) & (weld[b] > 0)
-        touch = (weld[a] != weld[b]) & ~(filters & related) & collide(m, a, b)
-        if len(b := b[touch | np.isin(b, [second for first, second in declared if first == a])]):
-            yield a, b
-
-
 def _self_contact(scene: Scene) -> Iterator[str]:
-    m, pairs = scene.mj_model, list(self_pairs(scene.mj_model))
+    m, pairs = scene.mj_model, [pair for pair in self_pairs(scene.mj_model) if pair not in scene.geom_pairs]
     if not pairs:
         return
-    names = " and ".join(label(m, Kind.mjOBJ_GEOM, int(geom)) for geom in (pairs[0][0], pairs[0][1][0]))
-    number = sum(len(others) for _, others in pairs)
-    count = f"{number} pairs of geoms, such as" if number > 1 else "the geoms"
-    base = base_geoms(m)
-    own = any(base[[a, *others]].any() for a, others in pairs)
+    names = " and ".join(label(m, Kind.mjOBJ_GEOM, geom) for geom in pairs[0])
+    count = f"{len(pairs)} pairs of geoms, such as" if len(pairs) > 1 else "the geoms"
     yield (
         f"The robot's parts pass through each other: {count} {names}, would collide in MuJoCo."
-        + " Geoms of its fixed base are among them." * own
+        + " Geoms of its fixed base are among them." * bool(base_geoms(m)[np.array(pairs)].any())
     )
 
 

@@ -441,7 +441,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 origin = vec3()
                 if wp.static(FLOATING):
                     origin = load_vec3(ck.q, here, 0)
-                pairs.recall(m, here, links, origin, ck, contacts)
+                here.blocks = pairs.recall(m, here, links, origin, ck, contacts)
             solve(m, here, ck, links, nodes, base)
             if wp.static(PAIRS):
                 pairs.correct_lambda(m, here, links, ck, contacts, nodes)

@@ -284,7 +284,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     constraint.begin_contacts(m, here, links, carrier, contacts)
                 newton.initialize(m, here, links, motions, loads, free_loads, root)
                 if wp.static(PAIRS):
-                    pairs.begin(m, here, links, motions, root.pos, contacts)
+                    here.blocks = pairs.begin(m, here, links, motions, root.pos, contacts)
                 phase = int(NEWTON)
                 while phase < DONE:
                     if phase == NEWTON and (status.passes == passes or not block.any_of(status.active)):

@@ -81,7 +81,9 @@ def add_constraints(
     if spec.pairs:
         # A block of rows between two bodies, see pairs.py; p is its point on the second one
         structs["Contact"] |= {
+            "row": int,  # its index in Model's rows
             "q": vec3,  # its point on the first one
+            "r": T,  # of two geoms, their distance less the margin
             "slope": T,  # of a joint's row, the ratio of the two joints' velocities
             "residual": vec3,  # of the conjugate gradients, as forces of the rows
             "direction": vec3,  # of their search, as such forces
@@ -94,4 +96,5 @@ def add_constraints(
         }
         structs["Motion"] |= work
         structs["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
+        structs["Lane"] |= {"blocks": int}  # number of those that act in the substep
         structs["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia

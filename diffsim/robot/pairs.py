@@ -1,7 +1,8 @@
-"""Rows of MuJoCo's constraints between two bodies: the equality constraints of a file, for kernels/pairs.py."""
+"""Rows of MuJoCo's constraints between two bodies: equality and contact of a file, for kernels/pairs.py."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,12 +10,15 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim.robot.elements import at_rest, label
-from diffsim.robot.scene import Array, Index, Scene
+from diffsim.robot.contact import base_geoms, collide, declared_pairs, pair_law
+from diffsim.robot.elements import at_rest, disabled_flags, label
+from diffsim.robot.scene import Array, Index, Scene, SceneError
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
-JOINT, POINT, TURN = range(3)  # kinds of blocks, see kernels/pairs.py
-NAMES = "joint", "point", "turn"
+Touch = Callable[[int, int], Array]  # two geoms
+JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs.py
+NAMES = "joint", "point", "turn", "geoms"
+SHAPES = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE  # of geoms that may touch each other
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
 
 
@@ -25,7 +29,9 @@ class Pairs(NamedTuple):
     link: Index  # (n, 2) first and second link, -1 for the world beside a floating base
     partner: Index  # (n,) the other block of a weld, or itself
     params: Array  # (n, 11) as Constraints.contact
-    shape: Array  # (n, 11) of a joint: q_0 of the second and of the first, five coefficients; of a turn: its scale
+    # (n, 11) of a joint: q_0 of the second and of the first, five coefficients; of a turn: its scale; of two geoms: the
+    # square of the distance where they may touch, radii, and half axes in their links' frames
+    shape: Array
     first: Array  # (n, 3) m
     second: Array  # (n, 3) m
     first_frame: Array  # (n, 3, 3)
@@ -35,6 +41,11 @@ class Pairs(NamedTuple):
     def features(self) -> frozenset[str]:
         """Return the names of the kinds that are there, for Scene.features."""
         return frozenset(f"{NAMES[kind]}_rows" for kind in self.kind.tolist())
+
+    @property
+    def geoms(self) -> int:
+        """Return the number of blocks of two geoms, which are the last ones."""
+        return int((self.kind == GEOMS).sum())
 
 
 class _Rows:
@@ -74,6 +85,19 @@ class _Rows:
         link = np.stack(links, 1).astype(np.int32)
         kinds, partners = (np.array(each, np.int32) for each in (kind, partner))
         return Pairs(kinds, link, partners, np.array(params), np.array(shape), *points, *frames)
+
+    def add_geoms(self, a: int, b: int, params: Array) -> None:
+        """Append the block of two geoms."""
+        m, ends, axes, reach = self.m, list[Frame](), list[Array](), params[10]
+        geoms = sorted((a, b), key=lambda geom: int(m.geom_type[geom]))  # MuJoCo's order: a sphere before a capsule
+        for geom in geoms:
+            end = self.frame(m.geom_bodyid[geom], self.data.geom_xpos[geom], self.data.geom_xmat[geom].reshape(3, 3))
+            half = m.geom_size[geom, 1] * (m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE)
+            ends.append(end)
+            axes.append(half * end[2][:, 2])
+            reach += m.geom_rbound[geom]
+        shape = max(reach, 0.0) ** 2, *m.geom_size[geoms, 0], *np.concatenate(axes)
+        self.add(GEOMS, ends[0], ends[1], params, 0, shape)
 
     def add_equality(self, k: int, row: Row) -> None:
         """Append the blocks of the file's equality constraint k."""
@@ -119,9 +143,47 @@ class _Rows:
         return objects, places, turns
 
 
-def rows_of(scene: Scene, row: Row) -> Pairs | None:
-    """Collect the rows between bodies of a scene; `row` makes a row of constants."""
+def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
+    """List the pairs of the robot's geoms that may touch each other: MuJoCo's filters."""
+    weld, found = m.body_weldid[m.geom_bodyid], list[tuple[int, int]]()
+    parent = m.body_weldid[m.body_parentid[weld]]
+    filters = "filterparent" not in disabled_flags(m)
+    parts = np.flatnonzero((weld > 0) | base_geoms(m))
+    declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
+    for k, a in enumerate(parts.tolist()):
+        b = parts[k + 1 :]
+        related = ((parent[a] == weld[b]) | (parent[b] == weld[a])) & (weld[a] > 0) & (weld[b] > 0)
+        touch = (weld[a] != weld[b]) & ~(filters & related) & collide(m, a, b)
+        touch |= np.isin(b, [second for first, second in declared if first == a])
+        found += [(a, other) for other in b[touch].tolist()]
+    return found
+
+
+def with_pairs(scene: Scene) -> Scene:
+    """Return a copy whose parts touch each other as the file lets them, where they are spheres and capsules.
+
+    It needs MuJoCo's contact.
+
+    Raises:
+        SceneError: the numbers of a pair are not simulated.
+    """
+    m, label_of = scene.mj_model, lambda geom: label(scene.mj_model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+    pairs = [pair for pair in self_pairs(m) if np.isin(m.geom_type[[*pair]], SHAPES).all()]
+    for pair in pairs:
+        declared = declared_pairs(m).get(pair)
+        solref = pair_law(m, *pair).solref
+        if (solref[0] > 0) != (solref[1] > 0):
+            raise SceneError(f"{scene.name}: geoms {' and '.join(map(label_of, pair))}: solref mixes signs")
+        if declared is not None and m.pair_friction[declared, 0] != m.pair_friction[declared, 1]:
+            raise SceneError(f"{scene.name}: geoms {' and '.join(map(label_of, pair))}: friction differs by direction")
+    return dataclasses.replace(scene, geom_pairs=tuple(pairs))
+
+
+def rows_of(scene: Scene, row: Row, touch: Touch) -> Pairs | None:
+    """Collect the rows between bodies of a scene; `row` and `touch` make rows of constants."""
     rows = _Rows(scene)
     for k in np.flatnonzero(scene.mj_model.eq_active0).tolist():
         rows.add_equality(k, row)
+    for a, b in scene.geom_pairs:
+        rows.add_geoms(a, b, touch(a, b))
     return rows.pairs()
