@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import test_constraint
 import torch
-from scenes import free_states, parse, pendulum, random_tree
-from test_constraint import CONES, H, check_gradients, check_neighbours, in_mujoco, step
+from scenes import free_states, parse, pendulum, random_tree, robot
+from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, step
 from test_gradient import gradients, weights
 
+from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
-from diffsim.robot.pairs import with_pairs
+from diffsim.robot.pairs import as_capsules, with_pairs
 from diffsim.robot.scene import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -240,6 +241,40 @@ def test_gradient_through_contact_is_that_of_differences(base, cone, rng):
         calm = np.argsort(np.where(touches, abs(ends).max(1), np.inf))[:6]
         assert touches[calm].all()
         check_gradients(scene, [x[calm] for x in states], rng)
+
+
+def test_other_shapes_touch_as_their_capsules(rng):
+    """Which MuJoCo has in their place here."""
+    arms = ""
+    for k, kind in enumerate(("box", "cylinder", "ellipsoid", "mesh", "sphere", "capsule")):
+        geom = f'type="{kind}" ' + (
+            'mesh="tetra" mass="1"' if kind == "mesh" else 'size="0.1 0.06 0.2" pos="0.02 0 0.1"'
+        )
+        place = f"{0.35 * np.cos(k)} {0.35 * np.sin(k)} 0"
+        arms += f'<body pos="{place}"> <joint axis="1 2 3" damping="1"/> <geom {geom}/> </body>'
+    mesh = '<asset><mesh name="tetra" vertex="0 0 0 .3 0 0 0 .2 0 0 0 .2"/></asset>'
+    scene = with_pairs(parse(robot(arms, mesh, "")))
+    states = rng.uniform(-2, 2, (32, 6)), 0.3 * rng.normal(size=(32, 6)), np.zeros((32, 0))
+    _, expected, kinds = in_mujoco(scene, *states, model=as_capsules(model_as_it_is(scene)))
+    assert len(scene.geom_pairs) == 15 and STATES["quadratic"] in kinds
+    np.testing.assert_allclose(step(scene, states)[1], expected, rtol=1e-8, atol=1e-8)
+    plates = '<body pos="0 0 {}"> <joint/> <geom type="box" size=".2 .2 .01"/> </body>'
+    assert not with_pairs(parse(robot(plates.format(0) + plates.format(0.1), "", ""))).geom_pairs  # capsules overlap
+
+
+@SLOW
+def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
+    """Steps that lack one count as unconverged, and no others."""
+    scene, states = tangled("fixed", "elliptic", 0, 64, rng)
+    model, pairs = model_as_it_is(scene), {(min(pair), max(pair)) for pair in scene.geom_pairs}
+    data, numbers = mujoco.MjData(model), []
+    for qpos in states[0]:
+        data.qpos = qpos
+        mujoco.mj_fwdPosition(model, data)
+        numbers.append(sum((min(pair), max(pair)) in pairs for pair in data.contact.geom.tolist()))
+    monkeypatch.setattr(robot_pairs, "MOST_PAIRS", 2)
+    residual = step(scene, states)[2]
+    assert ((residual > 1e-4) == (np.array(numbers) > 2)).all() and 2 in numbers and max(numbers) > 2
 
 
 def test_contact_in_single_precision_is_near(rng):

@@ -165,14 +165,6 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return first, second
 
     @wp.func
-    def gap(m: Model, s: int, links: Links):
-        """Return a lower bound of how far two geoms are beyond their margin, from their bounding spheres, squared."""
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
-        d = sp.on_link(links[j].R, links[j].x, m.row_second[s]) - sp.on_link(links[i].R, links[i].x, m.row_first[s])
-        return wp.dot(d, d) - T(m.row_shape[s][0])
-
-    @wp.func
     def segments(m: Model, s: int, links: Links):
         """Return the centres and the half axes of two geoms: x_1, a_1, x_2, a_2."""
         c = m.row_shape[s]

@@ -41,7 +41,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     t, block, geometry, base = types(spec), blocks(spec), pair_geometry(spec), base_inertia(spec)
     T, vec3, vec6, mat6, pick = t.T, t.vec3, t.vec6, t.mat6, block.pick
     Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
-    FLOATING, FIRST, ROOM = spec.floating, max(spec.spheres, 1), spec.room
+    FLOATING, ROOM = spec.floating, spec.room
     STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
 
     @wp.func
@@ -112,8 +112,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     ):
         """Solve H s = b where active is 1, given U s_0 as the blocks' rates: branches get s - s_0, blocks their y."""
         goal = T(0.0)
-        end = FIRST + here.blocks
-        for c in range(FIRST, end):
+        for c in range(here.begin, here.end):
             p = contacts[c].H * contacts[c].rate
             for r in range(3):
                 p[r] = pick(T(0.0), active, -p[r], T(0.0))
@@ -129,17 +128,17 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
         step = int(0)
         while step < STEPS and block.any_of(running):
             clear(branches)
-            for c in range(FIRST, end):
+            for c in range(here.begin, here.end):
                 spread(m, c, contacts, contacts[c].residual, branches)
             solve_tree(m, here, links, branches, L)
             pz = T(0.0)
-            for c in range(FIRST, end):
+            for c in range(here.begin, here.end):
                 pz = pz + wp.dot(contacts[c].residual, rates_of(m, c, contacts, branches))
             running = pick(enough, pz, running, T(0.0))
             beta = pick(T(0.0), last, pz / last, T(0.0))
             last = pz
             curvature = T(0.0)
-            for c in range(FIRST, end):
+            for c in range(here.begin, here.end):
                 q = contacts[c].residual + beta * contacts[c].direction
                 v = rates_of(m, c, contacts, branches) + beta * contacts[c].rate
                 contacts[c].direction = q
@@ -149,7 +148,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             if step == 0:  # 1 / alpha is about the factor by which s_0's residual exceeds b
                 enough = accuracy * accuracy * alpha * alpha * pz
             left = T(0.0)
-            for c in range(FIRST, end):
+            for c in range(here.begin, here.end):
                 q = contacts[c].direction
                 contacts[c].change = contacts[c].change + alpha * q
                 contacts[c].residual = contacts[c].residual - alpha * (q + contacts[c].H * contacts[c].rate)
@@ -158,7 +157,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             running = pick(goal, left, running, T(0.0))
             step = step + 1
         clear(branches)
-        for c in range(FIRST, end):
+        for c in range(here.begin, here.end):
             spread(m, c, contacts, contacts[c].change, branches)
         solve_tree(m, here, links, branches, L)
 

@@ -30,6 +30,7 @@ from diffsim.robot.pairs import GEOMS, JOINT, POINT, TURN
 ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterate's, in the norm of T^-1
 ACCURACY_ADJOINT = 1e-12, 1e-6  # the same of the adjoint's solve, in float64 and in float32
 SMALLEST = 1e-12  # of a violation whose direction is defined
+UNSOLVED = 1e8  # square of the acceleration by which a step is wrong that lacks a contact for want of room
 
 
 @cache
@@ -43,9 +44,9 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     )
     Nodes, Adjoints, Root, Newton, force_at = t.Nodes, t.Adjoints, t.Root, t.Newton, sp.force_at
     FLOATING, NV, SOLVES, PAIRS, WORLD = spec.floating, spec.nv, spec.solves, spec.pairs, spec.room - 1
-    EQUALITIES = spec.pairs - spec.geom_pairs
+    EQUALITIES, NPOINTS, LAST = spec.pair_sizes.equalities, spec.pair_sizes.points, spec.pair_sizes.blocks - 1
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
-    FIRST, COLUMN = max(spec.spheres, 1), 2 * NV + 3 * spec.spheres  # of jar in the checkpoint
+    COLUMN = 2 * NV + 3 * spec.spheres  # of jar in the checkpoint
     BASE, VADR = 7 * (spec.nlink - 1), spec.dof0 - 1
     JOINTS, POINTS, TURNS, TOUCH = spec.has("joint_rows point_rows turn_rows geoms_rows")
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]
@@ -98,22 +99,37 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         return vec4(contacts[c].active * state[0], state[1], state[2], state[3])
 
     @wp.func
-    def list_blocks(m: Model, links: Links, contacts: Contacts):
-        """List and place the blocks that act, of equality all, of geoms those near each other; returns their number."""
-        end = int(FIRST)
+    def list_blocks(m: Model, here: Lane, links: Links, contacts: Contacts):
+        """List and place the blocks that act, of equality all, of geoms those near each other; returns their end.
+
+        The element after the last one has a D if there is no room for all.
+        """
+        end = here.begin
+        last = here.begin + LAST
+        contacts[last].D = T(0.0)
         equalities = int(EQUALITIES)  # not unrolled
         pairs = int(PAIRS)
+        points = int(NPOINTS)
         for s in range(equalities):
             contacts[end].row = s
             geometry.place(m, end, links, contacts)
             end = end + 1
         if wp.static(TOUCH):
+            centres = wp.zeros(shape=NPOINTS, dtype=vec3)
+            for k in range(points):
+                i = m.point_link[k]
+                centres[k] = sp.on_link(links[i].R, links[i].x, m.point[k])
             for s in range(equalities, pairs):
-                if block.any_of(-geometry.gap(m, s, links)):
+                d = centres[m.row_points[2 * s + 1]] - centres[m.row_points[2 * s]]
+                if block.any_of(T(m.row_shape[s][0]) - wp.dot(d, d)):  # of their bounding spheres
                     contacts[end].row = s
-                    if block.any_of(geometry.place_geoms(m, end, links, contacts)):
-                        end = end + 1
-        return end - FIRST
+                    active = geometry.place_geoms(m, end, links, contacts)
+                    if block.any_of(active):
+                        if end < last:
+                            end = end + 1
+                        else:
+                            contacts[last].D = contacts[last].D + T(UNSOLVED) * active
+        return end
 
     @wp.func
     def rest_of(m: Model, c: int, links: Links, contacts: Contacts):
@@ -134,12 +150,12 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def begin(m: Model, here: Lane, links: Links, motions: Motions, origin: vec3, contacts: Contacts):
-        """Set up the blocks at the start of a substep, with zero acceleration; returns their number."""
+        """Set up the blocks at the start of a substep, with zero acceleration; returns their end."""
         place_world(links, origin)
         motions[WORLD].accel_link = join(vec3(), -vec3(m.gravity))
         forward.clear(motions)
-        count = list_blocks(m, links, contacts)
-        for c in range(FIRST, FIRST + count):
+        end = list_blocks(m, here, links, contacts)
+        for c in range(here.begin, end):
             s = contacts[c].row
             i = m.row_link[2 * s]
             j = m.row_link[2 * s + 1]
@@ -152,14 +168,14 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
             contacts[c].jar = jar
             contacts[c].f = f
             contacts[c].H = H
-        return count
+        return end
 
     @wp.func
     def add_forces(m: Model, here: Lane, contacts: Contacts, motions: Motions, loads: Loads):
         """Add the iterate's forces to the links' loads, and those on joints to the joints' rate."""
-        if here.blocks > 0:
+        if here.end > here.begin:
             forward.clear(motions)
-            for c in range(FIRST, FIRST + here.blocks):
+            for c in range(here.begin, here.end):
                 forward.spread(m, c, contacts, contacts[c].f, motions)
             for i in range(here.n):
                 loads[i].f = loads[i].f + motions[i].twist
@@ -169,14 +185,14 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         m: Model, here: Lane, links: Links, contacts: Contacts, motions: Motions, root: Root, status: Newton
     ):
         """Turn the tree's Newton step into that with the rows between bodies."""
-        if here.blocks > 0:
-            for c in range(FIRST, FIRST + here.blocks):
+        if here.end > here.begin:
+            for c in range(here.begin, here.end):
                 i = m.row_link[2 * contacts[c].row]
                 j = m.row_link[2 * contacts[c].row + 1]
                 A, B = motions[i].A, motions[j].A
                 contacts[c].rate = geometry.rates(m, c, contacts, A, B, motions[i].u, motions[j].u)
             forward.solve(m, here, links, contacts, motions, root.L, status.active, T(ACCURACY))
-            for c in range(FIRST, FIRST + here.blocks):
+            for c in range(here.begin, here.end):
                 contacts[c].Hs = -contacts[c].change
             motions[0].A = motions[0].A + motions[0].twist
             if wp.static(FLOATING):
@@ -191,7 +207,8 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     def trial(m: Model, here: Lane, motions: Motions, alpha: T, contacts: Contacts):
         """Evaluate the rows after the trial step alpha s; returns their part of newton.evaluate_trial."""
         total = vec6()
-        for c in range(FIRST, FIRST + here.blocks):
+        total[3] = contacts[here.begin + LAST].D  # no solution where a contact has no room
+        for c in range(here.begin, here.end):
             s = contacts[c].row
             i = m.row_link[2 * s]
             j = m.row_link[2 * s + 1]
@@ -217,23 +234,23 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def accept(here: Lane, contacts: Contacts):
         """Accept the last trial step."""
-        for c in range(FIRST, FIRST + here.blocks):
+        for c in range(here.begin, here.end):
             contacts[c].jar = contacts[c].trial_jar
             contacts[c].f = contacts[c].trial_force
 
     @wp.func
     def record(here: Lane, ck: Ck, contacts: Contacts):
         """Store jar of the blocks in the checkpoint."""
-        for c in range(FIRST, FIRST + here.blocks):
+        for c in range(here.begin, here.end):
             for r in range(3):
                 kin.store(ck.a, here.row, COLUMN + 3 * contacts[c].row + r, here.e, contacts[c].jar[r])
 
     @wp.func
     def recall(m: Model, here: Lane, links: Links, origin: vec3, ck: Ck, contacts: Contacts):
-        """Place the blocks as they were in a substep, with the jar that it ended with; returns their number."""
+        """Place the blocks as they were in a substep, with the jar that it ended with; returns their end."""
         place_world(links, origin)
-        count = list_blocks(m, links, contacts)
-        for c in range(FIRST, FIRST + count):
+        end = list_blocks(m, here, links, contacts)
+        for c in range(here.begin, end):
             s = contacts[c].row
             D, rest = rest_of(m, c, links, contacts)
             for axis in range(3):
@@ -241,7 +258,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
             f, H = law(m, s, D, contacts[c].jar, T(0.0))
             contacts[c].f = f
             contacts[c].H = H
-        return count
+        return end
 
     @wp.func
     def lambda_rates(m: Model, c: int, contacts: Contacts, nodes: Nodes):
@@ -252,7 +269,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def correct_lambda(m: Model, here: Lane, links: Links, ck: Ck, contacts: Contacts, nodes: Nodes):
         """Turn the tree's lambda, and the twists under it, into those with the rows between bodies."""
-        if here.blocks > 0:
+        if here.end > here.begin:
             row = SOLVES * here.row + SOLVES - 1
             for i in range(1, here.n):
                 for r in range(6):
@@ -265,7 +282,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
                     for c in range(r + 1):
                         L[r, c] = kin.load(ck.f, row, k, here.e)
                         k = k + 1
-            for c in range(FIRST, FIRST + here.blocks):
+            for c in range(here.begin, here.end):
                 contacts[c].rate = lambda_rates(m, c, contacts, nodes)
             backward.solve(m, here, links, contacts, nodes, L, T(1.0), T(ENOUGH))
             for i in range(here.n):
@@ -342,7 +359,9 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         add_twist_adjoint(i, -GA, join(R * (g_own - g_rate), vec3()), -wrench, links, nodes, adj)
 
     @wp.func
-    def equality_adjoint(m: Model, c: int, rate: vec3, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints):
+    def equality_adjoint(
+        m: Model, here: Lane, c: int, rate: vec3, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints
+    ):
         """Add the part of an equality's block, with that rate under lambda."""
         s = contacts[c].row
         i = m.row_link[2 * s]
@@ -360,7 +379,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         partner = m.row_partner[s]
         if partner != s:
             other = g_norm * geometry.violation(m, partner, links)
-            add_violation_adjoint(m, FIRST + partner, other, contacts, nodes, adj)
+            add_violation_adjoint(m, here.begin + partner, other, contacts, nodes, adj)
         if wp.static(JOINTS):
             if kind == JOINT:
                 curvature = geometry.polynomial(m, s, links[i].q - T(m.row_shape[s][1]))[2]
@@ -410,12 +429,12 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def add_adjoint(m: Model, here: Lane, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints):
         """Add the rows' part of phi, -f . rate under lambda, to the adjoints of links and joints."""
-        for c in range(FIRST, FIRST + here.blocks):
+        for c in range(here.begin, here.end):
             rate = lambda_rates(m, c, contacts, nodes)
             if m.row_kind[contacts[c].row] == GEOMS:
                 if wp.static(TOUCH):
                     geoms_adjoint(m, c, rate, links, contacts, nodes, adj)
             else:
-                equality_adjoint(m, c, rate, links, contacts, nodes, adj)
+                equality_adjoint(m, here, c, rate, links, contacts, nodes, adj)
 
     return functions(locals())

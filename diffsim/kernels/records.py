@@ -21,8 +21,15 @@ PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
         ("row_second_frame", "mat3s"),  # of the second one
     )
 }
-# Slots of the first and the second link; beside a floating base the world has one of its own
-PAIR_FIELDS["row_link"] = "ints", lambda n: np.where(n.scene.pairs.link < 0, n.scene.nlink, n.scene.pairs.link).flat
+PAIR_FIELDS["row_points"] = "ints", lambda n: n.scene.pairs.points[1].flat  # first and second, in the following two
+PAIR_FIELDS["point_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.points[0][:, 0])
+PAIR_FIELDS["point"] = "vec3s", lambda n: n.scene.pairs.points[0][:, 1:]  # m, in the link's frame
+PAIR_FIELDS["row_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.link).flat  # slots of the first and the second
+
+
+def slots_of(entries: Any, link: np.ndarray) -> np.ndarray:
+    """Return the slots of links; beside a floating base the world, -1, has one of its own."""
+    return np.where(link < 0, entries.scene.nlink, link)
 
 
 def add_constraints(
@@ -96,5 +103,8 @@ def add_constraints(
         }
         structs["Motion"] |= work
         structs["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
-        structs["Lane"] |= {"blocks": int}  # number of those that act in the substep
+        structs["Lane"] |= {
+            "begin": int,  # the first block's element of contacts
+            "end": int,  # the element after the last block that acts in the substep
+        }
         structs["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.contact import base_geoms, collide, declared_pairs, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
@@ -18,8 +19,19 @@ Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse wei
 Touch = Callable[[int, int], Array]  # two geoms
 JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs.py
 NAMES = "joint", "point", "turn", "geoms"
-SHAPES = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE  # of geoms that may touch each other
+_Geom = mujoco.mjtGeom
+SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "BOX", "MESH")]  # made capsules
+MOST_PAIRS = 64  # of geoms that touch at once, in the environments that a thread steps together
+UNBOUNDED = {int(_Geom.mjGEOM_PLANE), int(_Geom.mjGEOM_HFIELD), int(_Geom.mjGEOM_SDF)}
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
+
+
+class PairSizes(NamedTuple):
+    """Sizes that the kernels' code depends on."""
+
+    equalities: int = 0  # number of blocks of equality, which come first
+    points: int = 0  # number of points of blocks
+    blocks: int = 0  # number of blocks in local arrays, of which the last one has no use
 
 
 class Pairs(NamedTuple):
@@ -43,9 +55,17 @@ class Pairs(NamedTuple):
         return frozenset(f"{NAMES[kind]}_rows" for kind in self.kind.tolist())
 
     @property
-    def geoms(self) -> int:
-        """Return the number of blocks of two geoms, which are the last ones."""
-        return int((self.kind == GEOMS).sum())
+    def points(self) -> tuple[Array, NDArray[np.int64]]:
+        """Return each point once, its link before its coordinates (m, 4), and which ones are a block's (n, 2)."""
+        all_of = np.concatenate((self.link[..., None], np.stack((self.first, self.second), 1)), 2)
+        points, which = np.unique(all_of.reshape(-1, 4), axis=0, return_inverse=True)
+        return points, which.reshape(-1, 2)
+
+    @property
+    def sizes(self) -> PairSizes:
+        """Return sizes of the kernels' arrays."""
+        equalities = int((self.kind != GEOMS).sum())
+        return PairSizes(equalities, len(self.points[0]), min(len(self.kind), equalities + MOST_PAIRS) + 1)
 
 
 class _Rows:
@@ -53,6 +73,8 @@ class _Rows:
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.m, self.data = scene, scene.mj_model, at_rest(scene.mj_model)
+        capsules = as_capsules(self.m)
+        self.capsules = capsules, at_rest(capsules)
         self.links = list[tuple[Array, Array]]()  # pose of each link at the reference configuration
         for k in range(scene.nlink):
             rotation, position = self.links[scene.parent[k]] if k else (np.eye(3), np.zeros(3))
@@ -88,11 +110,11 @@ class _Rows:
 
     def add_geoms(self, a: int, b: int, params: Array) -> None:
         """Append the block of two geoms."""
-        m, ends, axes, reach = self.m, list[Frame](), list[Array](), params[10]
+        m, data, ends, axes, reach = *self.capsules, list[Frame](), list[Array](), params[10]
         geoms = sorted((a, b), key=lambda geom: int(m.geom_type[geom]))  # MuJoCo's order: a sphere before a capsule
         for geom in geoms:
-            end = self.frame(m.geom_bodyid[geom], self.data.geom_xpos[geom], self.data.geom_xmat[geom].reshape(3, 3))
-            half = m.geom_size[geom, 1] * (m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE)
+            end = self.frame(m.geom_bodyid[geom], data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))
+            half = m.geom_size[geom, 1] * (m.geom_type[geom] == _Geom.mjGEOM_CAPSULE)
             ends.append(end)
             axes.append(half * end[2][:, 2])
             reach += m.geom_rbound[geom]
@@ -159,24 +181,56 @@ def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
     return found
 
 
-def with_pairs(scene: Scene) -> Scene:
-    """Return a copy whose parts touch each other as the file lets them, where they are spheres and capsules.
+def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy whose geoms have the shapes that touch each other here: spheres, and capsules in place of the rest.
 
-    It needs MuJoCo's contact.
+    A capsule has the length of its geom's bounding box, and its mean width.
+    """
+    fitted = copy.copy(m)
+    for geom in np.flatnonzero(np.isin(m.geom_type, SHAPES)).tolist():
+        centre, half = np.split(m.geom_aabb[geom], 2)
+        along = int(half.argmax())
+        radius = float(np.delete(half, along).mean())
+        length = max(half[along] - radius, 0.0)
+        turn = np.zeros(4)
+        mujoco.mju_quatZ2Vec(turn, np.eye(3)[along])
+        mujoco.mju_mulPose(
+            fitted.geom_pos[geom], fitted.geom_quat[geom], m.geom_pos[geom], m.geom_quat[geom], centre, turn
+        )
+        fitted.geom_type[geom], fitted.geom_size[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE, (radius, length, 0.0)
+        fitted.geom_rbound[geom], fitted.geom_sameframe[geom] = radius + length, 0
+        fitted.geom_aabb[geom] = [0.0, 0.0, 0.0, radius, radius, radius + length]
+    return fitted
+
+
+def with_pairs(scene: Scene) -> Scene:
+    """Return a copy whose parts touch each other as the file lets them, on MuJoCo's contact.
+
+    Shapes other than spheres are capsules, see `as_capsules`. A pair is left out whose capsules overlap in the first
+    keyframe, or the reference pose, though the file's shapes do not.
 
     Raises:
         SceneError: the numbers of a pair are not simulated.
     """
-    m, label_of = scene.mj_model, lambda geom: label(scene.mj_model, mujoco.mjtObj.mjOBJ_GEOM, geom)
-    pairs = [pair for pair in self_pairs(m) if np.isin(m.geom_type[[*pair]], SHAPES).all()]
-    for pair in pairs:
-        declared = declared_pairs(m).get(pair)
-        solref = pair_law(m, *pair).solref
-        if (solref[0] > 0) != (solref[1] > 0):
-            raise SceneError(f"{scene.name}: geoms {' and '.join(map(label_of, pair))}: solref mixes signs")
-        if declared is not None and m.pair_friction[declared, 0] != m.pair_friction[declared, 1]:
-            raise SceneError(f"{scene.name}: geoms {' and '.join(map(label_of, pair))}: friction differs by direction")
+    m, pairs = scene.mj_model, list[tuple[int, int]]()
+    touching, overlapping = (touching_pairs(model) for model in (m, as_capsules(m)))
+    for a, b in self_pairs(m):
+        declared, solref = declared_pairs(m).get((a, b)), pair_law(m, a, b).solref
+        if (solref[0] > 0) != (solref[1] > 0) or (declared is not None and np.ptp(m.pair_friction[declared, :2])):
+            names = " and ".join(label(m, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in (a, b))
+            raise SceneError(f"{scene.name}: geoms {names}: solref of two signs, or friction that differs by direction")
+        if (a, b) not in overlapping - touching and not {m.geom_type[a], m.geom_type[b]} & UNBOUNDED:
+            pairs.append((a, b))
     return dataclasses.replace(scene, geom_pairs=tuple(pairs))
+
+
+def touching_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
+    """Return the pairs of geoms that touch in the first keyframe, or in the reference pose."""
+    data = mujoco.MjData(m)
+    if m.nkey:
+        mujoco.mj_resetDataKeyframe(m, data, 0)
+    mujoco.mj_fwdPosition(m, data)
+    return {(min(a, b), max(a, b)) for a, b in data.contact.geom.tolist()}
 
 
 def rows_of(scene: Scene, row: Row, touch: Touch) -> Pairs | None:
