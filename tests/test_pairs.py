@@ -16,6 +16,7 @@ from scenes import free_states, parse, pendulum, random_tree, robot
 from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, step
 from test_gradient import gradients, weights
 
+from diffsim.extra.report import approximations
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
 from diffsim.robot.pairs import as_capsules, with_pairs
@@ -25,7 +26,7 @@ from diffsim.sim.simulator import Simulator
 
 enough_passes = test_constraint.enough_passes
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs
-TANGLED = "floating", "fixed"
+TANGLED = "floating", "fixed", "objects"
 BASES = ["floating", *(pytest.param(base, marks=SLOW) for base in ("fixed", "planar", "ball"))]
 # Of which MuJoCo has added dJ/dt v to connect and weld
 WITH_DRIFT = tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 7)
@@ -159,7 +160,7 @@ def law(rng):
 
 
 def tangle(base, cone, seed):
-    """A robot of six links, whose spheres and capsules overlap each other, its fixed base or the ground.
+    """A robot of links whose spheres and capsules overlap each other, its fixed base, another robot or the ground.
 
     Two geoms have a <pair>, two bodies are excluded, and two are tied.
     """
@@ -185,7 +186,7 @@ def tangle(base, cone, seed):
         shape, name = geom(), next(number)
         return f'<body name="b{name}" pos="{words(*(0.12 * rng.normal(size=3)))}">{joint}{shape}{parts}</body>'
 
-    tree = body(0, "<freejoint/>" if base == "floating" else "")
+    tree = body(0, "" if base == "fixed" else "<freejoint/>") + body(2, "<freejoint/>") * (base == "objects")
     if base == "fixed":
         tree = f'<body name="root">{geom()}{tree}</body>'
     geoms, bodies = re.findall(r'"(g\d+)"', tree), re.findall(r'"(b\d+)"', tree)
@@ -202,8 +203,8 @@ def tangled(base, cone, seed, number, rng):
     """Such a robot, and states in some of which nothing touches."""
     scene = with_pairs(tangle(base, cone, seed))
     qpos, qvel, ctrl = free_states(scene, number, rng)
-    if base == "floating":
-        qpos[:, :3] = 0.05 * rng.normal(size=(number, 3))
+    for joint in np.flatnonzero(scene.mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        qpos[:, scene.mj_model.jnt_qposadr[joint] :][:, :3] = 0.05 * rng.normal(size=(number, 3))
     return scene, (qpos, 0.3 * qvel, ctrl)
 
 
@@ -256,6 +257,7 @@ def test_other_shapes_touch_as_their_capsules(rng):
     scene = with_pairs(parse(robot(arms, mesh, "")))
     states = rng.uniform(-2, 2, (32, 6)), 0.3 * rng.normal(size=(32, 6)), np.zeros((32, 0))
     _, expected, kinds = in_mujoco(scene, *states, model=as_capsules(model_as_it_is(scene)))
+    assert approximations(scene) == ("Shapes that touch others as capsules: 4 (surfaces differ by up to 105 mm).",)
     assert len(scene.geom_pairs) == 15 and STATES["quadratic"] in kinds
     np.testing.assert_allclose(step(scene, states)[1], expected, rtol=1e-8, atol=1e-8)
     plates = '<body pos="0 0 {}"> <joint/> <geom type="box" size=".2 .2 .01"/> </body>'
