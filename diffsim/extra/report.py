@@ -150,7 +150,7 @@ def _options(scene: Scene) -> Iterator[str]:
     other.opt.iterations, other.opt.ls_iterations = max(100, m.opt.iterations), max(50, m.opt.ls_iterations)
     other.geom_condim[:], other.pair_dim[:] = np.minimum(m.geom_condim, 3), np.minimum(m.pair_dim, 3)
     other.dof_frictionloss[: 6 * scene.floating] = 0
-    condim = max((pair_law(m, *pair).condim for pair in ground_pairs(m)), default=0)
+    condim = max((pair_law(m, *pair).condim for pair in (*ground_pairs(m), *scene.geom_pairs)), default=0)
     for there, what in (
         (m.opt.noslip_iterations > 0, "noslip_iterations"),
         (m.opt.solver != other.opt.solver or m.opt.iterations < 100, "a solver that may stop before it converges"),
