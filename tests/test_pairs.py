@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import re
-from itertools import count
+from itertools import count, product
 
 import mujoco
 import numpy as np
 import pytest
 import test_constraint
 import torch
-from scenes import free_states, parse, pendulum, random_tree
-from test_constraint import H, check_gradients, check_neighbours, in_mujoco, step
+from scenes import free_states, parse, pendulum, random_tree, robot
+from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, step
 from test_gradient import gradients, weights
 
+from diffsim.extra.report import approximations
+from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
+from diffsim.robot.pairs import as_capsules, with_pairs
 from diffsim.robot.scene import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
 enough_passes = test_constraint.enough_passes
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs
+TANGLED = "floating", "fixed", "objects"
 BASES = ["floating", *(pytest.param(base, marks=SLOW) for base in ("fixed", "planar", "ball"))]
 # Of which MuJoCo has added dJ/dt v to connect and weld
 WITH_DRIFT = tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 7)
@@ -73,7 +79,7 @@ def test_ten_trees_step_as_in_mujoco(base, rng):
         qvel, expected = step(scene, states)[1], in_mujoco(scene, *states)[1]
         errors.append(abs(qvel - expected).max(1) / abs(expected - states[1]).max(1))
     assert np.max(errors) < 1e-6 and np.median(errors) < 1e-10
-    assert {"joint_rows", "point_rows", "turn_rows"} < constrained(scene, H).features and scene.npairs == 0
+    assert {"joint_rows", "point_rows", "turn_rows"} < constrained(scene, H).features and scene.pairs is None
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -143,12 +149,155 @@ def test_a_four_bar_linkage_turns_as_in_mujoco(rng):
     check_gradients(scene, (qpos, qvel, states[2]), rng)
 
 
+# Contact
+
+
+def law(rng):
+    """Random attributes of a contact between two geoms."""
+    solref = f"{rng.uniform(0.01, 0.05)} {rng.uniform(0.5, 1.5)}" if rng.random() < 0.7 else "-900 -40"
+    ends = " ".join(map(str, rng.uniform((0.5, 0.9, 0.005, 0.2), (0.9, 0.97, 0.05, 0.8))))
+    return f'condim="{rng.choice([1, 3, 3])}" solref="{solref}" solimp="{ends} {rng.choice([1, 2, 3.5])}"'
+
+
+def tangle(base, cone, seed):
+    """A robot of links whose spheres and capsules overlap each other, its fixed base, another robot or the ground.
+
+    Two geoms have a <pair>, two bodies are excluded, and two are tied.
+    """
+    rng, number = np.random.default_rng(900 + seed), count(1)
+
+    def words(*values):
+        return " ".join(map(str, values))
+
+    def geom():
+        place = f'pos="{words(*(0.05 * rng.normal(size=3)))}" euler="{words(*rng.uniform(-180, 180, 3))}"'
+        mixed = f'friction="{rng.uniform(0.2, 1.5)}" solmix="{rng.uniform(0.5, 2)}" priority="{rng.choice([0, 0, 1])}"'
+        kind, size, name = (
+            rng.choice(["sphere", "capsule", "capsule"]),
+            words(*rng.uniform(0.05, 0.12, 2)),
+            next(number),
+        )
+        margin = rng.choice([0, 0.01])
+        return f'<geom name="g{name}" type="{kind}" size="{size}" {place} {mixed} {law(rng)} margin="{margin}"/>'
+
+    def body(depth, joint):
+        parts = "".join(body(depth + 1, "") for _ in range((2, 1, 1, 0)[depth]))
+        joint = joint or f'<joint axis="{words(*rng.normal(size=3))}" damping="0.1" range="-60 60"/>'
+        shape, name = geom(), next(number)
+        return f'<body name="b{name}" pos="{words(*(0.12 * rng.normal(size=3)))}">{joint}{shape}{parts}</body>'
+
+    tree = body(0, "" if base == "fixed" else "<freejoint/>") + body(2, "<freejoint/>") * (base == "objects")
+    if base == "fixed":
+        tree = f'<body name="root">{geom()}{tree}</body>'
+    geoms, bodies = re.findall(r'"(g\d+)"', tree), re.findall(r'"(b\d+)"', tree)
+    pair = f'<pair geom1="{geoms[-1]}" geom2="{geoms[0]}" friction="0.3 0.3" {law(rng)} margin="0.02"/>'
+    return parse(
+        f'<mujoco><option cone="{cone}" impratio="{rng.uniform(0.5, 3)}"/> <worldbody>'
+        f'<geom type="plane" size="1 1 1" pos="0 0 -0.15" {law(rng)}/> {tree} </worldbody>'
+        f'<contact> {pair} <exclude body1="{bodies[0]}" body2="{bodies[3]}"/> </contact>'
+        f'<equality> <connect body1="{bodies[2]}" body2="{bodies[-1]}" anchor="0 0 0.05"/> </equality> </mujoco>'
+    )
+
+
+def tangled(base, cone, seed, number, rng):
+    """Such a robot, and states in some of which nothing touches."""
+    scene = with_pairs(tangle(base, cone, seed))
+    qpos, qvel, ctrl = free_states(scene, number, rng)
+    for joint in np.flatnonzero(scene.mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        qpos[:, scene.mj_model.jnt_qposadr[joint] :][:, :3] = 0.05 * rng.normal(size=(number, 3))
+    return scene, (qpos, 0.3 * qvel, ctrl)
+
+
+def model_as_it_is(scene):
+    m = copy.copy(scene.mj_model)
+    m.opt.timestep, m.opt.iterations, m.opt.tolerance, m.opt.ls_iterations, m.opt.ls_tolerance = H, 200, 0, 100, 1e-10
+    return m
+
+
+TANGLES = [pytest.param(*each, marks=[SLOW] * (each != ("floating", "elliptic"))) for each in product(TANGLED, CONES)]
+
+
+@needs_drift
+@pytest.mark.parametrize("base, cone", TANGLES)
+def test_ten_robots_that_touch_themselves_step_as_in_mujoco(base, cone, rng):
+    """With friction of both cones and without, margins, mixed and declared parameters, on the ground and tied."""
+    errors = []
+    for seed in range(10):
+        scene, states = tangled(base, cone, seed, 16, rng)
+        qvel, residual = step(scene, states)[1:]
+        expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+        assert residual.max() < 1e-10 and abs(expected - in_mujoco(scene, *states)[1]).max() > 1e-3
+        errors.append(abs(qvel - expected).max(1) / abs(expected - states[1]).max(1))
+    assert np.max(errors) < 1e-6 and np.median(errors) < 1e-10
+    assert "geoms_rows" in constrained(scene, H).features
+
+
+@pytest.mark.parametrize("base, cone", TANGLES)
+def test_gradient_through_contact_is_that_of_differences(base, cone, rng):
+    """Where nothing is thrown about, as above."""
+    for seed in range(3):
+        scene, states = tangled(base, cone, seed, 96, rng)
+        ends, apart = (step(each, states, 4)[1] for each in (scene, dataclasses.replace(scene, geom_pairs=())))
+        touches = abs(ends - apart).max(1) > 1e-3
+        calm = np.argsort(np.where(touches, abs(ends).max(1), np.inf))[:6]
+        assert touches[calm].all()
+        check_gradients(scene, [x[calm] for x in states], rng)
+
+
+def test_other_shapes_touch_as_their_capsules(rng):
+    """Which MuJoCo has in their place here."""
+    arms = ""
+    for k, kind in enumerate(("box", "cylinder", "ellipsoid", "mesh", "sphere", "capsule")):
+        geom = f'type="{kind}" ' + (
+            'mesh="tetra" mass="1"' if kind == "mesh" else 'size="0.1 0.06 0.2" pos="0.02 0 0.1"'
+        )
+        place = f"{0.35 * np.cos(k)} {0.35 * np.sin(k)} 0"
+        arms += f'<body pos="{place}"> <joint axis="1 2 3" damping="1"/> <geom {geom}/> </body>'
+    mesh = '<asset><mesh name="tetra" vertex="0 0 0 .3 0 0 0 .2 0 0 0 .2"/></asset>'
+    scene = with_pairs(parse(robot(arms, mesh, "")))
+    states = rng.uniform(-2, 2, (32, 6)), 0.3 * rng.normal(size=(32, 6)), np.zeros((32, 0))
+    _, expected, kinds = in_mujoco(scene, *states, model=as_capsules(model_as_it_is(scene)))
+    assert approximations(scene) == ("Shapes that touch others as capsules: 4 (surfaces differ by up to 105 mm).",)
+    assert len(scene.geom_pairs) == 15 and STATES["quadratic"] in kinds
+    np.testing.assert_allclose(step(scene, states)[1], expected, rtol=1e-8, atol=1e-8)
+    plates = '<body pos="0 0 {}"> <joint/> <geom type="box" size=".2 .2 .01"/> </body>'
+    assert not with_pairs(parse(robot(plates.format(0) + plates.format(0.1), "", ""))).geom_pairs  # capsules overlap
+
+
+@SLOW
+def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
+    """Steps that lack one count as unconverged, and no others."""
+    scene, states = tangled("fixed", "elliptic", 0, 64, rng)
+    model, pairs = model_as_it_is(scene), {(min(pair), max(pair)) for pair in scene.geom_pairs}
+    data, numbers = mujoco.MjData(model), []
+    for qpos in states[0]:
+        data.qpos = qpos
+        mujoco.mj_fwdPosition(model, data)
+        numbers.append(sum((min(pair), max(pair)) in pairs for pair in data.contact.geom.tolist()))
+    monkeypatch.setattr(robot_pairs, "MOST_PAIRS", 2)
+    residual = step(scene, states)[2]
+    assert ((residual > 1e-4) == (np.array(numbers) > 2)).all() and 2 in numbers and max(numbers) > 2
+
+
+def test_contact_in_single_precision_is_near(rng):
+    """An environment whose parts touch leaves one beside it alone whose parts do not."""
+    scene, states = tangled("floating", "elliptic", 0, 9, rng)
+    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=8)
+    expected = step(scene, states, 4)[1]
+    assert residual.max() < 1e-4 and abs(qvel - expected).max() < 1e-3 * abs(expected).max()
+    check_neighbours(scene, [x[:8] for x in states])
+
+
 def test_what_rows_between_bodies_do_not_have_is_named():
     scene = parse(pendulum(rest='<equality><joint name="lock" joint1="hinge"/></equality>'))
     with pytest.raises(SceneError, match=r"soft contact has no equality constraints \('lock'\); choose MuJoCo's"):
         Simulator(scene, 1, Integration())
     with pytest.raises(ValueError, match="threads_per_env is 2, must be 1 with rows between two bodies"):
         Simulator(scene, 1, Integration("mujoco", 4), division=(2, 1))
+    with pytest.raises(
+        SceneError, match="soft contact has no contact between a robot's parts; choose MuJoCo's contact"
+    ):
+        Simulator(with_pairs(tangle("fixed", "elliptic", 0)), 1, Integration())
     far = parse(pendulum(rest='<equality><joint name="lock" joint1="hinge" solref="1e-30 1e-30"/></equality>'))
     far.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
     with pytest.raises(SceneError, match="equality 'lock': its solref, solimp, .* is out of range"):

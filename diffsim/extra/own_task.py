@@ -102,7 +102,7 @@ def around_start(task: Task) -> Scene:
         raise TaskError(f"task {task.name!r}: with action_scale the start's control must lie within ctrlrange: {names}")
     m.actuator_ctrllimited[:] = 1
     m.actuator_ctrlrange[:] = np.stack((zero, zero), 1) + np.minimum(scale, room)[:, None] * (-1.0, 1.0)
-    return dataclasses.replace(load_scene(m), name=scene.name, path=scene.path)
+    return dataclasses.replace(load_scene(m), name=scene.name, path=scene.path, geom_pairs=scene.geom_pairs)
 
 
 # Checks, which Task.bind asks for ------------------------------------------------------------------------------------

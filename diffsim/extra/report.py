@@ -14,14 +14,13 @@ from diffsim.extra.own_task import start_control
 from diffsim.robot.contact import (
     HULL_POINTS,
     base_geoms,
-    collide,
     contact_points,
-    declared_pairs,
     ground_pairs,
     hull,
     pair_law,
 )
-from diffsim.robot.elements import control_range, disabled_flags, label, listed, motors
+from diffsim.robot.elements import control_range, label, listed, motors
+from diffsim.robot.pairs import as_capsules, self_pairs
 from diffsim.robot.scene import Scene
 
 Kind, Geom, Integrator = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtIntegrator
@@ -81,33 +80,19 @@ def _bodies(scene: Scene) -> Iterator[str]:
         yield f"Mocap bodies stay where the file has them: {names}."
 
 
-def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield the robot's geoms, each with the later ones of other bodies that it may touch."""
-    weld = m.body_weldid[m.geom_bodyid]
-    parent = m.body_weldid[m.body_parentid[weld]]
-    filters = "filterparent" not in disabled_flags(m)
-    parts = np.flatnonzero((weld > 0) | base_geoms(m))
-    declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
-    for k, a in enumerate(parts.tolist()):
-        b = parts[k + 1 :]
-        related = ((parent[a] == weld[b]) | (parent[b] == weld[a])) & (weld[a] > 0) & (weld[b] > 0)
-        touch = (weld[a] != weld[b]) & ~(filters & related) & collide(m, a, b)
-        if len(b := b[touch | np.isin(b, [second for first, second in declared if first == a])]):
-            yield a, b
-
-
 def _self_contact(scene: Scene) -> Iterator[str]:
-    m, pairs = scene.mj_model, list(self_pairs(scene.mj_model))
-    if not pairs:
+    m, touching = scene.mj_model, set(scene.geom_pairs)
+    fitted = as_capsules(m)
+    if rough := [g for g in {*sum(touching, ())} if m.geom_type[g] != fitted.geom_type[g]]:
+        worst = max(float(abs(_reach(m, geom) - _reach(fitted, geom)).max()) for geom in rough)
+        yield f"Shapes that touch others as capsules: {len(rough)} (surfaces differ by up to {1e3 * worst:.3g} mm)."
+    if not (pairs := [pair for pair in self_pairs(m) if pair not in touching]):
         return
-    names = " and ".join(label(m, Kind.mjOBJ_GEOM, int(geom)) for geom in (pairs[0][0], pairs[0][1][0]))
-    number = sum(len(others) for _, others in pairs)
-    count = f"{number} pairs of geoms, such as" if number > 1 else "the geoms"
-    base = base_geoms(m)
-    own = any(base[[a, *others]].any() for a, others in pairs)
+    names = " and ".join(label(m, Kind.mjOBJ_GEOM, geom) for geom in pairs[0])
+    count = f"{len(pairs)} pairs of geoms, such as" if len(pairs) > 1 else "the geoms"
     yield (
         f"The robot's parts pass through each other: {count} {names}, would collide in MuJoCo."
-        + " Geoms of its fixed base are among them." * own
+        + " Geoms of its fixed base are among them." * bool(base_geoms(m)[np.array(pairs)].any())
     )
 
 
@@ -125,16 +110,36 @@ def _ground(scene: Scene) -> Iterator[str]:
 
 def _depth(m: mujoco.MjModel, geom: int) -> float:
     """Return how far [m] a shape reaches beyond its contact points, in the direction where that is farthest."""
+    turned = _directions() @ _axes(m, geom)
+    points = (turned @ contact_points(m, geom)[0].T).max(1) + _directions() @ m.geom_pos[geom]
+    return float((_reach(m, geom) - points).max())
+
+
+def _directions() -> NDArray[np.float64]:
     turn, z = np.pi * (3 - 5**0.5) * np.arange(DIRECTIONS), 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
     level = np.sqrt(1 - z**2)
-    x, y, (a, b, c) = level * np.cos(turn), level * np.sin(turn), m.geom_size[geom]
-    directions = np.stack((x, y, z), 1)
-    if m.geom_type[geom] == Geom.mjGEOM_MESH:
-        reach = (directions @ hull(m, m.geom_dataid[geom]).T).max(1)
-    else:
-        cylinder = m.geom_type[geom] == Geom.mjGEOM_CYLINDER
-        reach = a * level + b * abs(z) if cylinder else np.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2)
-    return float((reach - (directions @ contact_points(m, geom)[0].T).max(1)).max())
+    return np.stack((level * np.cos(turn), level * np.sin(turn), z), 1)
+
+
+def _axes(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, m.geom_quat[geom])
+    return axes.reshape(3, 3)
+
+
+def _reach(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
+    """Return how far [m] a shape reaches from its body's origin in each direction."""
+    directions, (a, b, c), kind = _directions() @ _axes(m, geom), m.geom_size[geom], m.geom_type[geom]
+    x, y, z = abs(directions.T)
+    reach = {
+        int(Geom.mjGEOM_SPHERE): a + 0 * z,
+        int(Geom.mjGEOM_CAPSULE): a + b * z,
+        int(Geom.mjGEOM_CYLINDER): a * np.hypot(x, y) + b * z,
+        int(Geom.mjGEOM_BOX): a * x + b * y + c * z,
+        int(Geom.mjGEOM_ELLIPSOID): np.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2),
+    }
+    corners = hull(m, m.geom_dataid[geom]) if kind == Geom.mjGEOM_MESH else np.zeros((1, 3))
+    return reach.get(int(kind), (directions @ corners.T).max(1)) + _directions() @ m.geom_pos[geom]
 
 
 def _options(scene: Scene) -> Iterator[str]:
@@ -145,7 +150,7 @@ def _options(scene: Scene) -> Iterator[str]:
     other.opt.iterations, other.opt.ls_iterations = max(100, m.opt.iterations), max(50, m.opt.ls_iterations)
     other.geom_condim[:], other.pair_dim[:] = np.minimum(m.geom_condim, 3), np.minimum(m.pair_dim, 3)
     other.dof_frictionloss[: 6 * scene.floating] = 0
-    condim = max((pair_law(m, *pair).condim for pair in ground_pairs(m)), default=0)
+    condim = max((pair_law(m, *pair).condim for pair in (*ground_pairs(m), *scene.geom_pairs)), default=0)
     for there, what in (
         (m.opt.noslip_iterations > 0, "noslip_iterations"),
         (m.opt.solver != other.opt.solver or m.opt.iterations < 100, "a solver that may stop before it converges"),

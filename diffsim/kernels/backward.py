@@ -48,7 +48,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint, parameters = muscle_law(spec), constraint_law(spec), parameter_adjoint(spec)
-    PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
+    PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_rows(spec) if spec.pairs else None
     CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
     CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT, BASE_DAMPED = spec.has("contact motor clamp muscle limit base_damping")
     LIMIT = LIMIT and not spec.constrained  # the penalty law
@@ -58,7 +58,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in spec.features
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.room
     # Local arrays have at least one element, also where they are not read.
-    CONTACTS = max(spec.spheres, 1) + spec.pairs
     NFACTORS, LEARNED = spec.parameters or (len(FACTORS) if VARIED else 1), spec.parameters > 0
     TENSIONS, BODIES = (NU if MUSCLE else 1), max(spec.forced, 1)
 
@@ -405,7 +404,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         nodes = wp.zeros(shape=SLOTS, dtype=Node)
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)
         if wp.static(PAIRS):
-            contacts = wp.zeros(shape=CONTACTS, dtype=Contact)
+            contacts = wp.zeros(shape=BLOCKS, dtype=Contact)
         adj_factors = wp.zeros(shape=NFACTORS, dtype=T)
         adj_forces = wp.zeros(shape=BODIES, dtype=vec6)
         tension = wp.zeros(shape=TENSIONS, dtype=T)
@@ -438,7 +437,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 origin = vec3()
                 if wp.static(FLOATING):
                     origin = load_vec3(ck.q, here, 0)
-                pairs.recall(m, here, links, origin, ck, contacts)
+                here.end = pairs.recall(m, here, links, origin, ck, contacts)
             solve(m, here, ck, links, nodes, base)
             if wp.static(PAIRS):
                 pairs.correct_lambda(m, here, links, ck, contacts, nodes)

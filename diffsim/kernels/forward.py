@@ -40,7 +40,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, sweep, constraint, newton = muscle_law(spec), articulated(spec), constraint_law(spec), newton_method(spec)
-    PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
+    PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_rows(spec) if spec.pairs else None
     CONTACT, MOTOR, CLAMP, MUSCLE = spec.has("contact motor clamp muscle")
     NU, FLOATING, FORCED = spec.nu, spec.floating, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
@@ -49,7 +49,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.room
     # Local arrays have at least one element, also where they are not read.
-    SPHERES, BALLS, TENSIONS = max(spec.spheres, 1) + spec.pairs, max(NBALL, 1), NU if MUSCLE else 1
+    SPHERES, BALLS, TENSIONS = max(spec.spheres, 1) + spec.pair_sizes.blocks, max(NBALL, 1), NU if MUSCLE else 1
 
     @wp.func
     def read_state(m: Model, here: Lane, batch: t.Batch, links: Links, ball_rot: Quats):
@@ -284,7 +284,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     constraint.begin_contacts(m, here, links, carrier, contacts)
                 newton.initialize(m, here, links, motions, loads, free_loads, root)
                 if wp.static(PAIRS):
-                    pairs.begin(m, here, links, motions, root.pos, contacts)
+                    here.begin = SPHERES - BLOCKS
+                    here.end = pairs.begin(m, here, links, motions, root.pos, contacts)
                 phase = int(NEWTON)
                 while phase < DONE:
                     if phase == NEWTON and (status.passes == passes or not block.any_of(status.active)):

@@ -363,7 +363,7 @@ def functions(names: dict[str, Any]) -> SimpleNamespace:
 
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     """Put the scene's numbers into a Model on a device."""
-    Model, entries = scene_types(dtype, scene.npairs > 0).Model, _Entries(scene, division)
+    Model, entries = scene_types(dtype, scene.pairs is not None).Model, _Entries(scene, division)
     model = Model()
     for name, member in Model.vars.items():
         kind, values = member.type, (FIELDS | PAIR_FIELDS)[name][1](entries)

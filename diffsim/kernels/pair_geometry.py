@@ -5,9 +5,13 @@ A block's `kind` tells what its rows are, between the links i (first) and j (sec
     JOINT    q_j - q_j0 - poly(q_i - q_i0) of two joints, or of one; the other two rows are empty
     POINT    a point of j less one of i: <connect>, or a <weld>'s translation
     TURN     the vector part of the quaternion (w, v) of j relative to i, times `torquescale`: a <weld>'s rotation
+    GEOMS    the nearest points of two segments with radii, spheres and capsules, in MuJoCo's frame E of their contact
 
 J maps the links' twists to E' (A_j - A_i): accelerations of the points for POINT, angular ones for TURN, where
 E' x = torquescale / 2 (w x + x x v) in the frame of i. MuJoCo adds dJ/dt v, the `drift`, to J a of POINT and TURN.
+
+A segment's points are x + s a, |s| <= 1, with a = 0 of a sphere. The derivative of their distance is that at fixed s,
+where it is least or at a bound (envelope theorem). That of the points adds m a, how s moves with them: `geoms_adjoint`.
 """
 
 from functools import cache
@@ -18,9 +22,13 @@ import warp as wp
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 from diffsim.robot.pairs import JOINT, POINT, TURN
 
 LEAST = 1e-12  # of 4 w^2, at a rotation by half a turn
+TINY = 1e-15  # MuJoCo's, of a distance and of a determinant
+# Least square of the sine between two segments for the adjoint of their nearest points, in float64 and in float32
+PARALLEL = 1e-12, 1e-6
 
 
 @cache
@@ -29,8 +37,9 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
     T, vec3, vec6, mat3 = t.T, t.vec3, t.vec6, t.mat3
     Model, Links, Contacts, force_at, point_velocity = t.Model, t.Links, t.Contacts, sp.force_at, sp.point_velocity
-    FIRST = max(spec.spheres, 1)  # the first block's element of contacts
+    pick = blocks(spec).pick
     JOINTS, POINTS, TURNS = spec.has("joint_rows point_rows turn_rows")
+    LEAST_DET = PARALLEL[int(t.U == wp.float32)]
 
     @wp.func
     def turn_of(m: Model, s: int, links: Links):
@@ -84,9 +93,9 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return r
 
     @wp.func
-    def place(m: Model, s: int, links: Links, contacts: Contacts):
-        """Set the block's points and frame."""
-        c = FIRST + s
+    def place(m: Model, c: int, links: Links, contacts: Contacts):
+        """Set the points and the frame of an equality's block."""
+        s = contacts[c].row
         i = m.row_link[2 * s]
         j = m.row_link[2 * s + 1]
         contacts[c].E = wp.identity(3, dtype=T)
@@ -104,9 +113,9 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
                 contacts[c].E = half * (R * (w * wp.identity(3, dtype=T) + wp.skew(v)))
 
     @wp.func
-    def rates(m: Model, s: int, contacts: Contacts, first: vec6, second: vec6, first_rate: T, second_rate: T):
+    def rates(m: Model, c: int, contacts: Contacts, first: vec6, second: vec6, first_rate: T, second_rate: T):
         """Return the rows' velocities of twists of both links and rates of their joints: J times those."""
-        c = FIRST + s
+        s = contacts[c].row
         v = vec3()
         if m.row_kind[s] == JOINT:
             v[0] = second_rate - contacts[c].slope * first_rate
@@ -123,15 +132,16 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return point_velocity(A, p) + wp.cross(wp.spatial_top(V), point_velocity(V, p))
 
     @wp.func
-    def drift(m: Model, s: int, links: Links, contacts: Contacts, first: vec6, second: vec6):
+    def drift(m: Model, c: int, links: Links, contacts: Contacts, first: vec6, second: vec6):
         """Return dJ/dt v of an equality's rows, from the links' accelerations A without those of joints."""
+        s = contacts[c].row
         i = m.row_link[2 * s]
         j = m.row_link[2 * s + 1]
         a = vec3()
         if wp.static(POINTS):
             if m.row_kind[s] == POINT:
-                a = point_acceleration(second, links[j].V, contacts[FIRST + s].p)
-                a = a - point_acceleration(first, links[i].V, contacts[FIRST + s].q)
+                a = point_acceleration(second, links[j].V, contacts[c].p)
+                a = a - point_acceleration(first, links[i].V, contacts[c].q)
         if wp.static(TURNS):
             if m.row_kind[s] == TURN:
                 w, v, R = turn_of(m, s, links)
@@ -140,9 +150,9 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return a
 
     @wp.func
-    def wrenches(m: Model, s: int, contacts: Contacts, f: vec3):
+    def wrenches(m: Model, c: int, contacts: Contacts, f: vec3):
         """Return the wrench of the rows' forces f on the second link, and minus that on the first; 0 of a joint's."""
-        c = FIRST + s
+        s = contacts[c].row
         world = contacts[c].E * f
         second = vec6()
         first = vec6()
@@ -152,6 +162,100 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         elif m.row_kind[s] != JOINT:
             second = force_at(contacts[c].p, world)
             first = force_at(contacts[c].q, world)
+        return first, second
+
+    @wp.func
+    def segments(m: Model, s: int, links: Links):
+        """Return the centres and the half axes of two geoms: x_1, a_1, x_2, a_2."""
+        c = m.row_shape[s]
+        i = m.row_link[2 * s]
+        j = m.row_link[2 * s + 1]
+        x1 = sp.on_link(links[i].R, links[i].x, m.row_first[s])
+        x2 = sp.on_link(links[j].R, links[j].x, m.row_second[s])
+        return x1, links[i].R * vec3(T(c[3]), T(c[4]), T(c[5])), x2, links[j].R * vec3(T(c[6]), T(c[7]), T(c[8]))
+
+    @wp.func
+    def clamped(x: T):
+        return wp.max(wp.min(x, T(1.0)), T(-1.0))
+
+    @wp.func
+    def nearest(x1: vec3, a1: vec3, x2: vec3, a2: vec3):
+        """Return s_1 and s_2 of the nearest points, and the vector from the first one to the second."""
+        ma = wp.dot(a1, a1)
+        mb = wp.dot(a1, a2)
+        mc = wp.dot(a2, a2)
+        u = wp.dot(a1, x2 - x1)
+        v = wp.dot(a2, x1 - x2)
+        s1 = pick(T(0.0), ma, clamped((mc * u + mb * v) / wp.max(ma * mc - mb * mb, T(TINY))), T(0.0))
+        free = (v + mb * s1) / wp.max(mc, T(TINY))
+        s2 = clamped(free)
+        moved = clamped((u + mb * s2) / wp.max(ma, T(TINY)))
+        s1 = pick(T(0.0), wp.abs(free - s2), moved, s1)
+        return s1, s2, (x2 + s2 * a2) - (x1 + s1 * a1)
+
+    @wp.func
+    def contact_frame(d: vec3):
+        """Return MuJoCo's frame (t_1, t_2, n) of a contact with the normal n along d, and |d|, n.y and |y - n n.y|."""
+        length = wp.length(d)
+        n = vec3(T(1.0), T(0.0), T(0.0))
+        for k in range(3):
+            n[k] = pick(T(TINY), length, d[k] / length, n[k])
+        across = pick(wp.abs(n[1]), T(0.5), T(1.0), T(0.0))
+        y = vec3(T(0.0), across, T(1.0) - across)
+        along = wp.dot(n, y)
+        t1 = y - along * n
+        size = wp.length(t1)
+        t1 = t1 / size
+        t2 = wp.cross(n, t1)
+        E = mat3(t1[0], t2[0], n[0], t1[1], t2[1], n[1], t1[2], t2[2], n[2])
+        return E, length, along, size
+
+    @wp.func
+    def place_geoms(m: Model, c: int, links: Links, contacts: Contacts):
+        """Set point, frame, violation and activity of two geoms' block; returns 1 within the margin, else 0."""
+        s = contacts[c].row
+        r1 = T(m.row_shape[s][1])
+        r2 = T(m.row_shape[s][2])
+        x1, a1, x2, a2 = segments(m, s, links)
+        s1, s2, d = nearest(x1, a1, x2, a2)
+        E, length, along, size = contact_frame(d)
+        n = vec3(E[0, 2], E[1, 2], E[2, 2])
+        contacts[c].E = E
+        contacts[c].p = x1 + s1 * a1 + T(0.5) * (d + (r1 - r2) * n)
+        contacts[c].q = contacts[c].p
+        contacts[c].r = length - r1 - r2 - T(m.row_params[s][10])
+        contacts[c].active = pick(contacts[c].r, T(0.0), T(1.0), T(0.0))
+        return contacts[c].active
+
+    @wp.func
+    def geoms_adjoint(m: Model, s: int, links: Links, g_p: vec3, g_r: T, g_turn: vec3):
+        """Return the adjoints of both links' poses, as wrenches.
+
+        Those of the point are g_p, of the distance g_r, of a rotation of the frame, in the frame, g_turn.
+        """
+        x1, a1, x2, a2 = segments(m, s, links)
+        s1, s2, d = nearest(x1, a1, x2, a2)
+        E, length, along, size = contact_frame(d)
+        n = vec3(E[0, 2], E[1, 2], E[2, 2])
+        half = T(0.5) * T(m.row_shape[s][1] - m.row_shape[s][2])
+        g_n = E * vec3(g_turn[1], -g_turn[0] - along / size * g_turn[2], T(0.0)) + half * (g_p - wp.dot(g_p, n) * n)
+        g_d = pick(T(TINY), length, T(1.0) / length, T(0.0)) * g_n + g_r * n
+        g1 = T(0.5) * g_p - g_d
+        g2 = T(0.5) * g_p + g_d
+        free1 = pick(wp.abs(s1), T(1.0), pick(T(0.0), wp.dot(a1, a1), T(1.0), T(0.0)), T(0.0))
+        free2 = pick(wp.abs(s2), T(1.0), pick(T(0.0), wp.dot(a2, a2), T(1.0), T(0.0)), T(0.0))
+        ma = pick(T(0.0), free1, wp.dot(a1, a1), T(1.0))
+        mb = free1 * free2 * wp.dot(a1, a2)
+        mc = pick(T(0.0), free2, wp.dot(a2, a2), T(1.0))
+        q1 = free1 * wp.dot(g1, a1)
+        q2 = free2 * wp.dot(g2, a2)
+        inv_det = T(1.0) / wp.max(ma * mc - mb * mb, T(LEAST_DET) * ma * mc)
+        m1 = free1 * (mc * q1 + mb * q2) * inv_det
+        m2 = -free2 * (mb * q1 + ma * q2) * inv_det
+        g1 = g1 - m1 * a1 - m2 * a2
+        g2 = g2 + m1 * a1 + m2 * a2
+        first = force_at(x1 + s1 * a1, g1) + sp.join(m1 * wp.cross(a1, d), vec3())
+        second = force_at(x2 + s2 * a2, g2) + sp.join(m2 * wp.cross(a2, d), vec3())
         return first, second
 
     return functions(locals())

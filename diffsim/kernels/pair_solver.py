@@ -41,7 +41,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     t, block, geometry, base = types(spec), blocks(spec), pair_geometry(spec), base_inertia(spec)
     T, vec3, vec6, mat6, pick = t.T, t.vec3, t.vec6, t.mat6, block.pick
     Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
-    FLOATING, FIRST, ROOM, PAIRS = spec.floating, max(spec.spheres, 1), spec.room, spec.pairs
+    FLOATING, ROOM = spec.floating, spec.room
     STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
 
     @wp.func
@@ -52,15 +52,16 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             branches[i].rate = T(0.0)
 
     @wp.func
-    def spread(m: Model, s: int, contacts: Contacts, f: vec3, branches: Branches):
+    def spread(m: Model, c: int, contacts: Contacts, f: vec3, branches: Branches):
         """Add the rows' forces f to the right-hand side: to the links' bias forces, and to the joints' forces."""
+        s = contacts[c].row
         i = m.row_link[2 * s]
         j = m.row_link[2 * s + 1]
-        first, second = geometry.wrenches(m, s, contacts, f)
+        first, second = geometry.wrenches(m, c, contacts, f)
         branches[i].twist = branches[i].twist + first
         branches[j].twist = branches[j].twist - second
         if m.row_kind[s] == JOINT:
-            branches[i].rate = branches[i].rate - contacts[FIRST + s].slope * f[0]
+            branches[i].rate = branches[i].rate - contacts[c].slope * f[0]
             branches[j].rate = branches[j].rate + f[0]
 
     @wp.func
@@ -98,11 +99,12 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
         branches[ROOM - 1].rate = T(0.0)
 
     @wp.func
-    def rates_of(m: Model, s: int, contacts: Contacts, branches: Branches):
+    def rates_of(m: Model, c: int, contacts: Contacts, branches: Branches):
+        s = contacts[c].row
         i = m.row_link[2 * s]
         j = m.row_link[2 * s + 1]
         a, b = branches[i].twist, branches[j].twist
-        return geometry.rates(m, s, contacts, a, b, branches[i].rate, branches[j].rate)
+        return geometry.rates(m, c, contacts, a, b, branches[i].rate, branches[j].rate)
 
     @wp.func
     def solve(
@@ -110,9 +112,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     ):
         """Solve H s = b where active is 1, given U s_0 as the blocks' rates: branches get s - s_0, blocks their y."""
         goal = T(0.0)
-        pairs = int(PAIRS)  # not unrolled
-        for s in range(pairs):
-            c = FIRST + s
+        for c in range(here.begin, here.end):
             p = contacts[c].H * contacts[c].rate
             for r in range(3):
                 p[r] = pick(T(0.0), active, -p[r], T(0.0))
@@ -120,7 +120,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             contacts[c].change = vec3()
             contacts[c].direction = vec3()
             contacts[c].rate = vec3()
-            goal = goal + T(m.row_params[s][4]) * wp.dot(p, p)
+            goal = goal + T(m.row_params[contacts[c].row][4]) * wp.dot(p, p)
         goal = T(ROUND_OFF) * accuracy * accuracy * goal
         running = pick(T(0.0), goal, T(1.0), T(0.0))
         enough = T(0.0)
@@ -128,20 +128,19 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
         step = int(0)
         while step < STEPS and block.any_of(running):
             clear(branches)
-            for s in range(pairs):
-                spread(m, s, contacts, contacts[FIRST + s].residual, branches)
+            for c in range(here.begin, here.end):
+                spread(m, c, contacts, contacts[c].residual, branches)
             solve_tree(m, here, links, branches, L)
             pz = T(0.0)
-            for s in range(pairs):
-                pz = pz + wp.dot(contacts[FIRST + s].residual, rates_of(m, s, contacts, branches))
+            for c in range(here.begin, here.end):
+                pz = pz + wp.dot(contacts[c].residual, rates_of(m, c, contacts, branches))
             running = pick(enough, pz, running, T(0.0))
             beta = pick(T(0.0), last, pz / last, T(0.0))
             last = pz
             curvature = T(0.0)
-            for s in range(pairs):
-                c = FIRST + s
+            for c in range(here.begin, here.end):
                 q = contacts[c].residual + beta * contacts[c].direction
-                v = rates_of(m, s, contacts, branches) + beta * contacts[c].rate
+                v = rates_of(m, c, contacts, branches) + beta * contacts[c].rate
                 contacts[c].direction = q
                 contacts[c].rate = v
                 curvature = curvature + wp.dot(v, q + contacts[c].H * v)
@@ -149,18 +148,17 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             if step == 0:  # 1 / alpha is about the factor by which s_0's residual exceeds b
                 enough = accuracy * accuracy * alpha * alpha * pz
             left = T(0.0)
-            for s in range(pairs):
-                c = FIRST + s
+            for c in range(here.begin, here.end):
                 q = contacts[c].direction
                 contacts[c].change = contacts[c].change + alpha * q
                 contacts[c].residual = contacts[c].residual - alpha * (q + contacts[c].H * contacts[c].rate)
                 p = contacts[c].residual
-                left = left + T(m.row_params[s][4]) * wp.dot(p, p)
+                left = left + T(m.row_params[contacts[c].row][4]) * wp.dot(p, p)
             running = pick(goal, left, running, T(0.0))
             step = step + 1
         clear(branches)
-        for s in range(pairs):
-            spread(m, s, contacts, contacts[FIRST + s].change, branches)
+        for c in range(here.begin, here.end):
+            spread(m, c, contacts, contacts[c].change, branches)
         solve_tree(m, here, links, branches, L)
 
     return functions(locals())

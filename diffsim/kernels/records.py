@@ -21,8 +21,15 @@ PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
         ("row_second_frame", "mat3s"),  # of the second one
     )
 }
-# Slots of the first and the second link; beside a floating base the world has one of its own
-PAIR_FIELDS["row_link"] = "ints", lambda n: np.where(n.scene.pairs.link < 0, n.scene.nlink, n.scene.pairs.link).flat
+PAIR_FIELDS["row_points"] = "ints", lambda n: n.scene.pairs.points[1].flat  # first and second, in the following two
+PAIR_FIELDS["point_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.points[0][:, 0])
+PAIR_FIELDS["point"] = "vec3s", lambda n: n.scene.pairs.points[0][:, 1:]  # m, in the link's frame
+PAIR_FIELDS["row_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.link).flat  # slots of the first and the second
+
+
+def slots_of(entries: Any, link: np.ndarray) -> np.ndarray:
+    """Return the slots of links; beside a floating base the world, -1, has one of its own."""
+    return np.where(link < 0, entries.scene.nlink, link)
 
 
 def add_constraints(
@@ -81,7 +88,9 @@ def add_constraints(
     if spec.pairs:
         # A block of rows between two bodies, see pairs.py; p is its point on the second one
         structs["Contact"] |= {
+            "row": int,  # its index in Model's rows
             "q": vec3,  # its point on the first one
+            "r": T,  # of two geoms, their distance less the margin
             "slope": T,  # of a joint's row, the ratio of the two joints' velocities
             "residual": vec3,  # of the conjugate gradients, as forces of the rows
             "direction": vec3,  # of their search, as such forces
@@ -94,4 +103,8 @@ def add_constraints(
         }
         structs["Motion"] |= work
         structs["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
+        structs["Lane"] |= {
+            "begin": int,  # the first block's element of contacts
+            "end": int,  # the element after the last block that acts in the substep
+        }
         structs["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 from diffsim.kernels.lanes import Division
+from diffsim.robot.pairs import PairSizes
 from diffsim.robot.scene import Scene
 
 FAR = 256.0  # m and rad, beyond which rounding a substep's motion to float32 matters
@@ -35,7 +36,8 @@ class KernelSpec:
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
     constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
     spheres: int = 0  # with constraints, the most contact spheres of a lane
-    pairs: int = 0  # number of blocks of rows between two bodies (pairs.py)
+    pairs: int = 0  # number of blocks of rows between two bodies (pairs.py), and
+    pair_sizes: PairSizes = PairSizes()
 
     def has(self, names: str) -> list[bool]:
         """Return for each of these features whether the scene has it."""
@@ -95,6 +97,7 @@ def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = Fa
         forced=scene.nbody if forced else 0,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
         spheres=max(map(len, division.spheres)) if options.get("constrained") else 0,
-        pairs=scene.npairs,
+        pairs=len(scene.pairs.kind) if scene.pairs else 0,
+        pair_sizes=scene.pairs.sizes if scene.pairs else PairSizes(),
         **options,
     )

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from diffsim.robot.contact import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
-from diffsim.robot.pairs import Pairs, rows_of
+from diffsim.robot.pairs import GEOMS, Pairs, rows_of
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene, SceneError, takes_euler
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
@@ -37,6 +37,11 @@ class Constraints(NamedTuple):
     loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
     pairs: Pairs | None = None  # rows between two bodies, see robot/pairs.py
 
+    @property
+    def rough(self) -> bool:
+        """Tell whether a contact has friction."""
+        return bool(self.contact[:, 2].any() or (self.pairs and self.pairs.params[self.pairs.kind == GEOMS, 2].any()))
+
 
 def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
     """Return a copy with MuJoCo's constraints for that length of a substep, to be solved in single precision or not.
@@ -49,7 +54,11 @@ def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
         raise SceneError(f"{scene.name}: on MuJoCo's contact {'; '.join(found)}")
     fastest = 0.0 if "refsafe" in disabled_flags(m) else 2 * seconds
     ground = ground_pairs(m)[0][0] if len(scene.spheres.geom) else 0
-    contact = [_contact(scene, ground, geom, fastest, single) for geom in scene.spheres.geom.tolist()]
+
+    def touch(a: int, b: int) -> Array:
+        return _contact(scene, a, b, fastest, single)
+
+    contact = [touch(ground, geom) for geom in scene.spheres.geom.tolist()]
     least = LEAST_WEIGHT_SINGLE if single else LEAST_WEIGHT
 
     def row(solref: Array, solimp: Array, weight: float, what: str) -> Array:
@@ -81,7 +90,7 @@ def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
             scene.spheres.axis,
             limit,
             np.array([(0.0, 1.0, 0.0), *loss]),
-            rows_of(scene, row),
+            rows_of(scene, row, touch),
         ),
     )
 
@@ -93,6 +102,8 @@ def check_soft(scene: Scene) -> None:
     if joints:
         names = listed(label(m, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints)
         raise SceneError(f"{scene.name}: soft contact has no frictionloss (joint {names}); choose MuJoCo's contact")
+    if scene.geom_pairs:
+        raise SceneError(f"{scene.name}: soft contact has no contact between a robot's parts; choose MuJoCo's contact")
     if rows := np.flatnonzero(m.eq_active0).tolist():
         names = listed(label(m, mujoco.mjtObj.mjOBJ_EQUALITY, k) for k in rows)
         raise SceneError(f"{scene.name}: soft contact has no equality constraints ({names}); choose MuJoCo's contact")

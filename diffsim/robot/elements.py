@@ -37,8 +37,8 @@ def numeric(m: mujoco.MjModel, name: str) -> Array:
 
 
 def floating(m: mujoco.MjModel) -> bool:
-    """Tell whether the robot has a free joint."""
-    return bool((m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+    """Tell whether the only tree of bodies has a free joint; beside others it is three slides and a ball."""
+    return m.ntree == 1 and bool((m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
 
 
 def motors(m: mujoco.MjModel) -> NDArray[np.bool_]:
@@ -81,8 +81,10 @@ def _set_bits(bits: Mapping[str, int], prefix: str, flags: int) -> set[str]:
 
 
 def at_rest(m: mujoco.MjModel) -> mujoco.MjData:
-    """Compute MuJoCo's kinematics of the reference pose."""
+    """Compute MuJoCo's kinematics of the reference pose, in which no free joint and no ball is turned."""
     data = mujoco.MjData(m)
+    for adr in m.jnt_qposadr[m.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist():
+        data.qpos[adr + 3 : adr + 7] = 1.0, 0.0, 0.0, 0.0
     mujoco.mj_kinematics(m, data)
     mujoco.mj_comPos(m, data)
     return data

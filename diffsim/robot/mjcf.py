@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from diffsim.robot.contact import contact_points, ground_pairs
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, numeric, servos
+from diffsim.robot.pairs import with_pairs
 from diffsim.robot.refuse import beyond, obstacles, strays
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
 
-Geom = mujoco.mjtGeom
+Geom, Joint = mujoco.mjtGeom, mujoco.mjtJoint
+DOFS = {int(Joint.mjJNT_FREE): 6, int(Joint.mjJNT_BALL): 3}  # of joints with several
 
 
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
@@ -45,7 +47,8 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     _refuse(file, obstacles(model))
     scene = dataclasses.replace(_Reader(model, file).scene(), left_out=tuple(left_out))
     _refuse(file, beyond(scene))
-    return scene
+    beside = model.ntree > 1 and Joint.mjJNT_FREE in model.jnt_type
+    return with_pairs(scene) if beside else scene
 
 
 def _refuse(file: Path, found: list[str]) -> None:
@@ -140,34 +143,34 @@ class _Reader:
         rotation = parent_rotation @ _matrix(m.body_quat[body])
         position = parent_position + parent_rotation @ m.body_pos[body]
         joints = range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])
-        if joints and m.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE:
-            link, rotation, position = 0, np.eye(3), np.zeros(3)
-        else:
-            for joint in joints:
-                anchor = np.array(m.jnt_pos[joint])
-                position = position + rotation @ anchor
-                for k in range(3 if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else 1):
-                    parent, link = link, self._link(joint) + k
-                    self.parent[link], self.rotation[link], self.position[link] = parent, rotation, position
-                    rotation, position = np.eye(3), np.zeros(3)
-                position = -anchor
+        free = bool(joints) and m.jnt_type[joints[0]] == Joint.mjJNT_FREE
+        rotation = np.eye(3) if free else rotation
+        if free and self.first:
+            link, position, joints = 0, np.zeros(3), range(0)
+        for joint in joints:
+            anchor = np.array(m.jnt_pos[joint])
+            position = position + rotation @ anchor
+            for k in range(DOFS.get(int(m.jnt_type[joint]), 1)):
+                parent, link = link, self._link(joint) + k
+                self.parent[link], self.rotation[link], self.position[link] = parent, rotation, position
+                rotation, position = np.eye(3), np.zeros(3)
+            position = -anchor
         self.body.append((link, rotation, position))
 
     def _joints(self) -> dict[str, Any]:
         """Read the joints into columns (nlink, ...), zero for the base."""
-        m, kind = self.m, mujoco.mjtJoint
-        dof = np.arange(self.first, m.nv)
+        m, dof = self.m, np.arange(self.first, self.m.nv)
         joint = m.dof_jntid[dof]
-        ball, limited = m.jnt_type[joint] == kind.mjJNT_BALL, m.jnt_limited[joint] != 0
-        nth, at = dof - m.jnt_dofadr[joint], m.jnt_qposadr[joint]
+        nth, limited, free = dof - m.jnt_dofadr[joint], m.jnt_limited[joint] != 0, m.jnt_type[joint] == Joint.mjJNT_FREE
+        ball, at = (m.jnt_type[joint] == Joint.mjJNT_BALL) | (free & (nth > 2)), m.jnt_qposadr[joint] + nth * free
 
         def column(values: Array, base: float = 0.0) -> Array:
             return np.concatenate((np.full((1, *values.shape[1:]), base), values))
 
         return {
-            "slide": np.concatenate(([False], m.jnt_type[joint] == kind.mjJNT_SLIDE)),
-            "ball": np.concatenate(([-1], np.where(ball, nth, -1))).astype(np.int32),
-            "axis": column(np.where(ball[:, None], np.eye(3)[nth], m.jnt_axis[joint])),
+            "slide": np.concatenate(([False], (m.jnt_type[joint] == Joint.mjJNT_SLIDE) | (free & ~ball))),
+            "ball": np.concatenate(([-1], np.where(ball, nth % 3, -1))).astype(np.int32),
+            "axis": column(np.where((ball | free)[:, None], np.eye(3)[nth % 3], m.jnt_axis[joint])),
             "joint_ref": column(np.where(ball, 0.0, m.qpos0[at])),
             "armature": column(m.dof_armature[dof]),
             **{name: column(values, base) for name, (values, base) in self._springs(joint, ball).items()},
@@ -215,7 +218,7 @@ class _Reader:
             link, gear = self._gear(a)
             bounds[link - 1] = np.sort(gear * m.actuator_forcerange[a])
         for joint in np.unique(m.actuator_trnid[driven, 0]).tolist():
-            if m.jnt_actfrclimited[joint] and m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_BALL:
+            if m.jnt_actfrclimited[joint] and m.jnt_type[joint] != Joint.mjJNT_BALL:
                 own = bounds[self._link(joint) - 1]
                 own[:] = own.clip(*m.jnt_actfrcrange[joint])
         return bounds.T
@@ -273,7 +276,7 @@ class _Reader:
         """Return the link of a joint's actuator, and the joint's force per force of the actuator."""
         m = self.m
         joint, axis = m.actuator_trnid[a, 0], 0
-        if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
+        if m.jnt_type[joint] == Joint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
             axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
         return self._link(joint) + axis, m.actuator_gear[a, axis]
 

@@ -1,21 +1,37 @@
-"""Rows of MuJoCo's constraints between two bodies: the equality constraints of a file, for kernels/pairs.py."""
+"""Rows of MuJoCo's constraints between two bodies: equality and contact of a file, for kernels/pairs.py."""
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.elements import at_rest, label
-from diffsim.robot.scene import Array, Index, Scene
+from diffsim.robot.contact import base_geoms, collide, declared_pairs, pair_law
+from diffsim.robot.elements import at_rest, disabled_flags, label
+from diffsim.robot.scene import Array, Index, Scene, SceneError
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
-JOINT, POINT, TURN = range(3)  # kinds of blocks, see kernels/pairs.py
-NAMES = "joint", "point", "turn"
+Touch = Callable[[int, int], Array]  # two geoms
+JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs.py
+NAMES = "joint", "point", "turn", "geoms"
+_Geom = mujoco.mjtGeom
+SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "BOX", "MESH")]  # made capsules
+MOST_PAIRS = 64  # of geoms that touch at once, in the environments that a thread steps together
+UNBOUNDED = {int(_Geom.mjGEOM_PLANE), int(_Geom.mjGEOM_HFIELD), int(_Geom.mjGEOM_SDF)}
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
+
+
+class PairSizes(NamedTuple):
+    """Sizes that the kernels' code depends on."""
+
+    equalities: int = 0  # number of blocks of equality, which come first
+    points: int = 0  # number of points of blocks
+    blocks: int = 0  # number of blocks in local arrays, of which the last one has no use
 
 
 class Pairs(NamedTuple):
@@ -25,7 +41,9 @@ class Pairs(NamedTuple):
     link: Index  # (n, 2) first and second link, -1 for the world beside a floating base
     partner: Index  # (n,) the other block of a weld, or itself
     params: Array  # (n, 11) as Constraints.contact
-    shape: Array  # (n, 11) of a joint: q_0 of the second and of the first, five coefficients; of a turn: its scale
+    # (n, 11) of a joint: q_0 of the second and of the first, five coefficients; of a turn: its scale; of two geoms: the
+    # square of the distance where they may touch, radii, and half axes in their links' frames
+    shape: Array
     first: Array  # (n, 3) m
     second: Array  # (n, 3) m
     first_frame: Array  # (n, 3, 3)
@@ -36,12 +54,27 @@ class Pairs(NamedTuple):
         """Return the names of the kinds that are there, for Scene.features."""
         return frozenset(f"{NAMES[kind]}_rows" for kind in self.kind.tolist())
 
+    @property
+    def points(self) -> tuple[Array, NDArray[np.int64]]:
+        """Return each point once, its link before its coordinates (m, 4), and which ones are a block's (n, 2)."""
+        all_of = np.concatenate((self.link[..., None], np.stack((self.first, self.second), 1)), 2)
+        points, which = np.unique(all_of.reshape(-1, 4), axis=0, return_inverse=True)
+        return points, which.reshape(-1, 2)
+
+    @property
+    def sizes(self) -> PairSizes:
+        """Return sizes of the kernels' arrays."""
+        equalities = int((self.kind != GEOMS).sum())
+        return PairSizes(equalities, len(self.points[0]), min(len(self.kind), equalities + MOST_PAIRS) + 1)
+
 
 class _Rows:
     """Collects blocks of rows."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.m, self.data = scene, scene.mj_model, at_rest(scene.mj_model)
+        capsules = as_capsules(self.m)
+        self.capsules = capsules, at_rest(capsules)
         self.links = list[tuple[Array, Array]]()  # pose of each link at the reference configuration
         for k in range(scene.nlink):
             rotation, position = self.links[scene.parent[k]] if k else (np.eye(3), np.zeros(3))
@@ -74,6 +107,19 @@ class _Rows:
         link = np.stack(links, 1).astype(np.int32)
         kinds, partners = (np.array(each, np.int32) for each in (kind, partner))
         return Pairs(kinds, link, partners, np.array(params), np.array(shape), *points, *frames)
+
+    def add_geoms(self, a: int, b: int, params: Array) -> None:
+        """Append the block of two geoms."""
+        m, data, ends, axes, reach = *self.capsules, list[Frame](), list[Array](), params[10]
+        geoms = sorted((a, b), key=lambda geom: int(m.geom_type[geom]))  # MuJoCo's order: a sphere before a capsule
+        for geom in geoms:
+            end = self.frame(m.geom_bodyid[geom], data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))
+            half = m.geom_size[geom, 1] * (m.geom_type[geom] == _Geom.mjGEOM_CAPSULE)
+            ends.append(end)
+            axes.append(half * end[2][:, 2])
+            reach += m.geom_rbound[geom]
+        shape = max(reach, 0.0) ** 2, *m.geom_size[geoms, 0], *np.concatenate(axes)
+        self.add(GEOMS, ends[0], ends[1], params, 0, shape)
 
     def add_equality(self, k: int, row: Row) -> None:
         """Append the blocks of the file's equality constraint k."""
@@ -119,9 +165,79 @@ class _Rows:
         return objects, places, turns
 
 
-def rows_of(scene: Scene, row: Row) -> Pairs | None:
-    """Collect the rows between bodies of a scene; `row` makes a row of constants."""
+def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
+    """List the pairs of the robot's geoms that may touch each other: MuJoCo's filters."""
+    weld, found = m.body_weldid[m.geom_bodyid], list[tuple[int, int]]()
+    parent = m.body_weldid[m.body_parentid[weld]]
+    filters = "filterparent" not in disabled_flags(m)
+    parts = np.flatnonzero((weld > 0) | base_geoms(m))
+    declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
+    for k, a in enumerate(parts.tolist()):
+        b = parts[k + 1 :]
+        related = ((parent[a] == weld[b]) | (parent[b] == weld[a])) & (weld[a] > 0) & (weld[b] > 0)
+        touch = (weld[a] != weld[b]) & ~(filters & related) & collide(m, a, b)
+        touch |= np.isin(b, [second for first, second in declared if first == a])
+        found += [(a, other) for other in b[touch].tolist()]
+    return found
+
+
+def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy whose geoms have the shapes that touch each other here: spheres, and capsules in place of the rest.
+
+    A capsule has the length of its geom's bounding box, and its mean width.
+    """
+    fitted = copy.copy(m)
+    for geom in np.flatnonzero(np.isin(m.geom_type, SHAPES)).tolist():
+        centre, half = np.split(m.geom_aabb[geom], 2)
+        along = int(half.argmax())
+        radius = float(np.delete(half, along).mean())
+        length = max(half[along] - radius, 0.0)
+        turn = np.zeros(4)
+        mujoco.mju_quatZ2Vec(turn, np.eye(3)[along])
+        mujoco.mju_mulPose(
+            fitted.geom_pos[geom], fitted.geom_quat[geom], m.geom_pos[geom], m.geom_quat[geom], centre, turn
+        )
+        fitted.geom_type[geom], fitted.geom_size[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE, (radius, length, 0.0)
+        fitted.geom_rbound[geom], fitted.geom_sameframe[geom] = radius + length, 0
+        fitted.geom_aabb[geom] = [0.0, 0.0, 0.0, radius, radius, radius + length]
+    return fitted
+
+
+def with_pairs(scene: Scene) -> Scene:
+    """Return a copy whose parts touch each other as the file lets them, on MuJoCo's contact.
+
+    Shapes other than spheres are capsules, see `as_capsules`. A pair is left out whose capsules overlap in the first
+    keyframe, or the reference pose, though the file's shapes do not.
+
+    Raises:
+        SceneError: the numbers of a pair are not simulated.
+    """
+    m, pairs = scene.mj_model, list[tuple[int, int]]()
+    touching, overlapping = (touching_pairs(model) for model in (m, as_capsules(m)))
+    for a, b in self_pairs(m):
+        declared, solref = declared_pairs(m).get((a, b)), pair_law(m, a, b).solref
+        if (solref[0] > 0) != (solref[1] > 0) or (declared is not None and np.ptp(m.pair_friction[declared, :2])):
+            names = " and ".join(label(m, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in (a, b))
+            raise SceneError(f"{scene.name}: geoms {names}: solref of two signs, or friction that differs by direction")
+        if (a, b) not in overlapping - touching and not {m.geom_type[a], m.geom_type[b]} & UNBOUNDED:
+            pairs.append((a, b))
+    return dataclasses.replace(scene, geom_pairs=tuple(pairs))
+
+
+def touching_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
+    """Return the pairs of geoms that touch in the first keyframe, or in the reference pose."""
+    data = mujoco.MjData(m)
+    if m.nkey:
+        mujoco.mj_resetDataKeyframe(m, data, 0)
+    mujoco.mj_fwdPosition(m, data)
+    return {(min(a, b), max(a, b)) for a, b in data.contact.geom.tolist()}
+
+
+def rows_of(scene: Scene, row: Row, touch: Touch) -> Pairs | None:
+    """Collect the rows between bodies of a scene; `row` and `touch` make rows of constants."""
     rows = _Rows(scene)
     for k in np.flatnonzero(scene.mj_model.eq_active0).tolist():
         rows.add_equality(k, row)
+    for a, b in scene.geom_pairs:
+        rows.add_geoms(a, b, touch(a, b))
     return rows.pairs()

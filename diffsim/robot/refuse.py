@@ -54,8 +54,6 @@ ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
 EQUALITIES = "connect", "weld", "joint"
 WITHOUT_EQUALITY = 'remove it, or all of them by <flag equality="disable"/>'
-SECOND = "next to a floating robot no other body has joints, and next to any robot no other one is free"
-ALONE = "or, if it touches nothing, set contype and conaffinity of its geoms to 0"
 ONLY_DRAWN = "; set contype and conaffinity to 0 if only drawn"
 
 
@@ -126,7 +124,6 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
     yield "body", (m.body_mocapid >= 0) & _touching(m), f"contact of a mocap body is not simulated{ONLY_DRAWN}"
-    yield "body", _others(m), f"{SECOND}; remove its joints and their actuators, {ALONE}"
     yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
     yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
 

@@ -131,6 +131,7 @@ class Scene:
     viscosity: float = 0.0  # kg/(m s)
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
+    geom_pairs: tuple[tuple[int, int], ...] = ()  # of the robot's geoms that may touch each other, see robot/pairs.py
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
     parameters: int = 0  # number of constants whose gradients the backward kernel computes, see extra/parameters.py
 
@@ -158,11 +159,6 @@ class Scene:
     def pairs(self) -> Pairs | None:
         """Return the rows between two bodies, which MuJoCo's constraints may have."""
         return self.constraints.pairs if self.constraints else None
-
-    @property
-    def npairs(self) -> int:
-        """Return the number of blocks of rows between two bodies."""
-        return len(self.pairs.kind) if self.pairs else 0
 
     @property
     def qpos_adr(self) -> Index:
@@ -196,7 +192,7 @@ class Scene:
             "ball": self.nball > 0,
             "contact": self.ncontact > 0,
             "terrain": self.ncontact > 0 and self.terrain is not None,
-            "pyramid": law is not None and pyramidal and bool(law.contact[:, 2].any()),
+            "pyramid": law is not None and pyramidal and law.rough,
             "box": law is not None and bool(law.axis[self.contact_radius == 0].any()),
             "limit": bool((limited & ((self.k_limit != 0) | (self.d_limit != 0) | (law is not None))).any()),
             "frictionloss": law is not None and bool(law.loss[:, 0].any()),

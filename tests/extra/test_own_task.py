@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import mujoco
@@ -317,7 +318,9 @@ def test_action_zero_of_a_scaled_task_is_the_control_of_its_start(
     np.testing.assert_allclose(ranges.mean(1), zero, atol=1e-12)
     np.testing.assert_allclose(ranges[:, 1] - ranges[:, 0], 2 * np.array(width))
     np.testing.assert_allclose(scene.gear, 0.5 * np.ptp(ranges, 1) * (9, -8, 1))
-    assert scene.name == task.load_robot().name
+    touching = dataclasses.replace(task.load_robot(), geom_pairs=((0, 1),))
+    assert scene.name == touching.name
+    assert type("Touching", (kind,), {"load_robot": classmethod(lambda cls: touching)})().scene().geom_pairs
     if "ctrl" not in keys or "0 0 0" in keys or "start" in attributes:  # no actuator pushes there
         data = mujoco.MjData(model)
         data.qpos, data.ctrl = start[0].numpy(), ranges.mean(1)

@@ -16,7 +16,6 @@ from scenes import (
 )
 
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import SceneError
 
 
 def test_box_touches_with_its_corners():
@@ -78,11 +77,10 @@ def test_bodies_beside_a_robot_that_touch_nothing_are_left_out():
     assert load_scene(mujoco.MjSpec.from_string(text)).left_out == scene.left_out
     solid = text.replace(ghost, '<geom size="0.1"/>')
     tied = text.replace("</mujoco>", '<tendon><fixed><joint joint="unused" coef="1"/></fixed></tendon></mujoco>')
-    for bad in (solid, tied):
-        with pytest.raises(SceneError, match="'post'.*next to a floating robot no other body has joints"):
-            parse(bad)
-    with pytest.raises(SceneError, match="next to a floating robot no other body has joints"):
-        load_scene(full)  # of which nothing can be removed
+    for each in (parse(solid), parse(tied), load_scene(full)):  # of a model nothing can be removed
+        assert each.left_out == () and not each.floating and (each.nq, each.nv) == (full.nq, full.nv)
+        np.testing.assert_array_equal(each.qpos_adr[1:7], [0, 1, 2, 3, 4, 5])
+    assert len(parse(solid).geom_pairs) == 8 and load_scene(full).geom_pairs == ()
 
 
 def test_a_mocap_body_that_touches_nothing_stays():

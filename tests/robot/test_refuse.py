@@ -79,10 +79,6 @@ REFUSED = {  # what the variants of test_variants.py have not
     ),
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),
-    "body 'post': next to a floating robot no other body has joints, and next to any robot no other one is free; ": [
-        robot(f'<body>{base}{BALL}</body><body name="post">{joint}{BALL}</body>')  # which the robot can touch
-        for base, joint in (("<freejoint/>", "<joint/>"), ("<joint/>", "<freejoint/>"), ("<freejoint/>",) * 2)
-    ],
     "body 'hand': contact of a mocap body is not simulated; set contype and conaffinity to 0 if only drawn": pendulum(
         world=f'<body name="hand" mocap="true">{BALL}</body>'
     ),

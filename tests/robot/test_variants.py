@@ -285,7 +285,6 @@ ODD = {  # numbers and names that no robot has, by place, with the words that re
     "rest": {
         EXACT: ['<custom><text name="\u96ea \U0001f600" data="\u2028"/></custom>'],
         "repeated name": ['<custom><text name="t" data="a"/><text name="t" data="b"/></custom>'],
-        "no other body has joints": ['<worldbody><body><joint/><geom size="0.1"/></body></worldbody>'],
     },
     "root": {EXACT: [f"<freejoint/>{SIXTY}"]},
 }
