@@ -135,6 +135,18 @@ def test_landscape(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert len(tables.read_csv(tmp_path / "landscape.csv")) == 3 and (tmp_path / "landscape.png").is_file()
 
 
+def test_particles_begin_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = load("particles")
+    monkeypatch.setattr(module, "EVERY", 1)
+    monkeypatch.setattr(module, "SETTING", "--num-envs 4 --horizon 8 --minibatch-size 32 --epochs 1")
+    module.main(module.Args(iterations=1, output=tmp_path))
+    first, _, second, last = tables.read_csv(tmp_path / "particles.csv")
+    assert (first["control steps"], second["control steps"]) == ("0", "32")
+    assert (first["lowest"], first["highest"], first["moved"]) == ("-1", "1", "0")
+    assert second["median deviation"] != first["median deviation"] and last["joint"] == module.JOINTS[1]
+    assert (tmp_path / "particles.png").is_file()
+
+
 def test_bandit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Particles begin evenly; what they learn is tested in tests/test_pfpn.py."""
     module = load("bandit")
