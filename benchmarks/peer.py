@@ -169,7 +169,7 @@ def train(args: Args, name: Name) -> Iterator[Row]:
 
 
 KEY = ("task", "environments")
-SPEED = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward", "lost"  # of the columns those that a page shows
+SPEED = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward"  # of the columns those that a page shows
 TRAIN = "task", "seed", "control steps", "training (s)", "control steps/s", "return", "lost"
 
 

@@ -279,7 +279,7 @@ def iteration(device: str, name: str, learner: str, num_envs: int, horizon: int,
 
 
 def shown_iterations(rows: Sequence[Mapping[str, str]]) -> list[Row]:
-    """A learner's techniques side by side: milliseconds of each, launches as a graph and compiled."""
+    """A learner's techniques side by side: milliseconds of each."""
     cases: dict[tuple[str, ...], dict[str, Mapping[str, str]]] = {}
     for row in rows:
         cases.setdefault((row["learner"], row["task"], row["environments"]), {})[row["technique"]] = row
@@ -288,7 +288,6 @@ def shown_iterations(rows: Sequence[Mapping[str, str]]) -> list[Row]:
         line: dict[str, object] = {"case": f"{learner}, {task}", "environments": environments}
         line |= {f"{name} (ms)": by[name]["ms"] for name in ("eager", "graph", "compiled") if name in by}
         if "compiled" in by:
-            line["launches"] = f"{by['graph']['launches']}, {by['compiled']['launches']}"
             line["start, compiled (s)"] = by["compiled"]["start (s)"]
         table.append(line)
     return table
