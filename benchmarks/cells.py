@@ -47,7 +47,7 @@ class Group(NamedTuple):
     learners: Sequence[str]
     tasks: Sequence[str]
     seeds: int
-    page: str = "experiments.md"
+    page: str = ""  # of docs/, which has the group's table
     timed: bool = True  # or its cells may share their machine, and have no seconds
     picture: bool = False  # of the curves, under the group's name
     ratios: bool = False  # the table has these of its two learners' best returns

@@ -20,7 +20,7 @@ from diffsim import DiffEnv
 from diffsim.extra.variation import on_a_plane
 from diffsim.extra.watch import make_policy_env
 from diffsim.sim.options import check_device
-from diffsim.tasks import TaskError, find_task
+from diffsim.tasks import FILE, TaskError, find_task
 from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy
 from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
@@ -144,7 +144,8 @@ class Case(NamedTuple):
         learner += " --symmetric" if args.get("symmetric") else ""
         learner += " randomised" if self.env.task.varied_by else ""
         learner += f" --initial-log-std {first:g}" if (first := args.get("initial_log_std")) else ""
-        learner += f" rough {slope:g}" if (slope := getattr(find_task(self.saved.task()), "slope", 0.0)) else ""
+        if not FILE.fullmatch(args["env"]) and (slope := getattr(find_task(args["env"]), "slope", 0.0)):
+            learner += f" rough {slope:g}"
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
         values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
         return dict(zip(ABOUT, values, strict=True))
@@ -155,13 +156,13 @@ def checkpoint_of(path: Path) -> Path:
     return (path / "checkpoint.pt" if path.is_dir() else path).resolve()
 
 
-def load_case(path: Path, num_envs: int, device: str) -> Case:
-    """The policy of a checkpoint or of a run's, on a plane; one of another task than ours ends the benchmark with one
-    line."""
+def load_case(path: Path, num_envs: int, device: str, own: str | None = None) -> Case:
+    """The policy of a checkpoint or of a run's, on a plane; own: FILE:CLASS of its task, whose code runs. One of
+    another task ends the benchmark with one line."""
     path = checkpoint_of(path)
     saved = load_policy(path)
     try:
-        find_task(saved.task())
+        find_task(task := saved.task(own))
     except TaskError as error:
         fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
@@ -169,7 +170,7 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
         f"{run.parent.name}/{run.name}",
         path,
         saved,
-        make_policy_env(saved, num_envs, device=device, env=on_a_plane(saved.task())),
+        make_policy_env(saved, num_envs, device=device, env=on_a_plane(task)),
     )
 
 

@@ -4,8 +4,8 @@
     python benchmarks/gradients.py ant go2                              some of them
     python benchmarks/gradients.py runs/learning/ppo_mujoco/*__1        policies, one of each task
 
-A policy acts with noise from states that it visits. The reward of a window is differentiated with respect to a shift
-of all of the window's actions: how well its mean over the environments agrees with differences of the mean reward,
+A policy acts with noise from states that it visits. The reward of a rollout is differentiated with respect to a shift
+of all of the rollout's actions: how well its mean over the environments agrees with differences of the mean reward,
 which see jumps that no derivative sees. All begin in one state, with its commands, clocks and random numbers. How far
 differences agree among themselves bounds that: by two sizes of the shift, and between two halves of the environments.
 The standard error of what they differ by, relative to the differences, tells how much other environments would change.
@@ -36,7 +36,7 @@ GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "soft": {"contact": "soft"},
     "mujoco": {"contact": "mujoco"},
 }
-WINDOWS = 4, 8, 16  # control steps
+ROLLOUTS = 4, 8, 16  # control steps
 TINY, FEW = 1e-6, 32  # the shift in float64, and of how many environments at most
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
 AGREE, CHANCE = 0.9, 0.5  # the page shows cosines where differences by SHIFT and by half of it agree better than by
@@ -48,9 +48,9 @@ Policy = Callable[[Tensor], Tensor | float]
 @dataclass
 class Args(common.CheckpointFlags):
     num_envs: Count = 1024  # environments
-    horizons: tuple[Count, ...] = WINDOWS  # control steps of a window
+    horizons: tuple[Count, ...] = ROLLOUTS  # control steps of a rollout
     directions: Count = 12  # of the shift, at most: random ones where there are more controls
-    warmup: Count = 150  # control steps before the window
+    warmup: Count = 150  # control steps before the rollout
 
     @property
     def measured(self) -> tuple[Path, ...]:
@@ -62,8 +62,8 @@ def still(obs: Tensor) -> float:
     return 0.0
 
 
-def window(env: DiffEnv, policy: Policy, horizon: int, shift: Tensor, noise: Tensor) -> Tensor:
-    """(N,) rewards of the window from where env is; shift (N, nu) and noise (T, N, nu) add to the actions."""
+def rollout(env: DiffEnv, policy: Policy, horizon: int, shift: Tensor, noise: Tensor) -> Tensor:
+    """(N,) rewards of the rollout from where env is; shift (N, nu) and noise (T, N, nu) add to the actions."""
     obs, total = env.detach(), torch.zeros_like(noise[0, :, 0])
     for k in range(horizon):
         obs, reward, *_ = env.step(policy(obs) + shift + noise[k])
@@ -80,22 +80,22 @@ def axes(nu: int, most: int) -> Tensor:
 
 @torch.no_grad()
 def differences(env: DiffEnv, policy: Policy, noise: Tensor, along: Tensor, size: float) -> Tensor:
-    """(N, K) central differences of each environment's reward of a window, along directions (K, nu) of the shift."""
+    """(N, K) central differences of each environment's reward of a rollout, along directions (K, nu) of the shift."""
     start, slopes = env.state_dict(), []
     for direction in along.to(noise):
         ends = []
         for shift in (size * direction, -size * direction):
             env.load_state_dict(start)
-            ends.append(window(env, policy, len(noise), shift.expand_as(noise[0]), noise))
+            ends.append(rollout(env, policy, len(noise), shift.expand_as(noise[0]), noise))
         slopes.append((ends[0] - ends[1]) / (2 * size))
     env.load_state_dict(start)
     return torch.stack(slopes, dim=1)
 
 
 def gradient(env: DiffEnv, policy: Policy, noise: Tensor) -> Tensor:
-    """(N, nu) derivative of each environment's reward of a window with respect to the shift."""
+    """(N, nu) derivative of each environment's reward of a rollout with respect to the shift."""
     shift = torch.zeros_like(noise[0], requires_grad=True)
-    return torch.autograd.grad(window(env, policy, len(noise), shift, noise).sum(), shift)[0]
+    return torch.autograd.grad(rollout(env, policy, len(noise), shift, noise).sum(), shift)[0]
 
 
 def error(env: DiffEnv, state: dict[str, Any], policy: Policy, noise: Tensor, along: Tensor) -> float:
@@ -133,7 +133,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     for ground, contact in GROUNDS.items():
         options = contact | {"horizon": max(args.horizons), "early_termination": False, "max_episode_steps": 10**9}
         try:
-            env = diffsim.make(task, n, **options)  # in which no episode ends: a reset within a window is no slope
+            env = diffsim.make(task, n, **options)  # in which no episode ends: a reset within a rollout is no slope
             exact = diffsim.make(task, min(n, FEW), **options, dtype=torch.float64, tolerance=1e-10)
         except SceneError as refusal:
             print(f"  {str(refusal).partition(' (')[0]}")
@@ -142,7 +142,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         drawn = torch.Generator().manual_seed(SEED)
         noise = NOISE * torch.randn(args.warmup, n, env.scene.nu, generator=drawn)
         with torch.no_grad():
-            window(env, policy, args.warmup, torch.zeros(n, env.scene.nu), noise)
+            rollout(env, policy, args.warmup, torch.zeros(n, env.scene.nu), noise)
         start, along = env.state_dict(), axes(env.scene.nu, args.directions)
         for horizon in args.horizons:
             noise = NOISE * torch.randn(horizon, n, env.scene.nu, generator=drawn)
@@ -161,9 +161,11 @@ def shown(rows: list[dict[str, str]]) -> list[Row]:
     hard = [row for row in rows if row["ground"] == "mujoco"]
     for (task, learner), own in grouped(hard, "task", "learner").items():
         sure = [row for row in own if float(row["differences"]) > AGREE and float(row.get("chance") or 0) < CHANCE]
+        if not sure:
+            continue
         cosines = {int(row["horizon"]): row["cosine"] for row in sure}
         ratios = {int(row["horizon"]): row.get("ratio", "") for row in sure}
-        line = {f"cosine, {k} steps": cosines.get(k, "") for k in WINDOWS}
+        line = {f"cosine, {k} steps": cosines.get(k, "") for k in ROLLOUTS}
         name = task if learner == "noise" else f"{task}, {learner}"
         lines.append({"task": name} | line | {"ratio, 8 steps": ratios.get(8, "")})
     return lines

@@ -189,36 +189,21 @@ def whole(rows: list[dict[str, str]]) -> list[Row]:
     ]
 
 
-GAIT: dict[str, tuple[str, Callable[[Sequence[float]], float]]] = {
-    "left-right": (".2f", max),
-    "diagonal": (".2f", max),
-    "clearance (m)": (".3f", min),
-    "slip (m/s)": (".2f", max),
-    "action change": (".0%", max),
-    "saturated": (".0%", max),
-    "cost of transport": (".2f", max),
-}
-
-
-def gaits(rows: list[dict[str, str]]) -> list[Row]:
-    """Gaits in the file's world: a line for each number, a column for each task, learner and machine."""
-    plain = {policy: undisturbed(group) for policy, group in policies(rows).items()}
-    return [
-        {"gait": name} | {policy: with_worst(own, name, *how) for policy, own in plain.items()}
-        for name, how in GAIT.items()
-    ]
-
-
 def race(rows: list[dict[str, str]]) -> list[Row]:
-    """Seconds of training to an error, from checkpoints along the way: a line for each task, learner and seed."""
+    """Seconds of training to an error, from checkpoints along the way: a line for each task and learner, with all
+    seeds."""
     lines = list[Row]()
-    for (task, learner, seed), group in grouped(rows, "task", "learner", "seed").items():
-        group.sort(key=lambda row: float(row["training s"]))
-        line: dict[str, object] = {"task": task, "learner": learner, "seed": seed}
-        for most in RACE:
-            reached = (row["training s"] for row in group if float(row["error"]) <= most and float(row["whole"]) == 1)
-            line[f"s to {most:g} m/s"] = next(reached, "")
-        lines.append(line | {"in all (s)": group[-1]["training s"], "last error (m/s)": group[-1]["error"]})
+    for (task, learner), seeds in grouped(rows, "task", "learner").items():
+        columns = dict[str, list[str]]()
+        for group in grouped(seeds, "seed").values():
+            group.sort(key=lambda row: float(row["training s"]))
+            for most in RACE:
+                good = (row["training s"] for row in group if float(row["error"]) <= most and float(row["whole"]) == 1)
+                columns.setdefault(f"s to {most:g} m/s", []).append(next(good, "never"))
+            columns.setdefault("in all (s)", []).append(group[-1]["training s"])
+            columns.setdefault("last error (m/s)", []).append(group[-1]["error"])
+        line = {name: ", ".join(cells) for name, cells in columns.items()}
+        lines.append({"task": task, "learner": learner.partition(" ")[0]} | line)
     return lines
 
 
@@ -247,7 +232,6 @@ def main(args: Args) -> None:
         return
     rows = measured(args, Part("joystick", measure, key, "joystick", PAGE, table))
     args.publish("whole", tables.markdown(whole(rows)), PAGE)
-    print(tables.markdown(gaits(rows)))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import cells
 import common
 import numpy as np
 import paper
-from cells import LEARNERS, RETURNS, Curve
+from cells import RETURNS, Curve
 from common import LEARNT, Line, Panel, plot, run
 from tables import Row, grouped, markdown, read_csv
 
@@ -26,7 +26,11 @@ GPUS = "h200", "h100"  # of a learner with results on both the first one counts
 SHOWN = "rpo shac sapo ppo_4096 ppo_baseline bptt sac_baseline sac_large redq redq_500 mbpo se_mbpo".split()
 COLUMNS = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")
 MAIN = {"rpo": "RPO", "shac": "SHAC", "ppo_4096": "PPO"}  # in the README
-RACES = ("joystick_race", "error", "go2", "error (m/s)"), ("tracking_race", "success", "g1_track", "success")
+RACES = (
+    ("joystick_race", "error", "go2", "error (m/s)"),
+    ("joystick_race", "error", "g1", "error (m/s)"),
+    ("tracking_race", "success", "g1_track", "success"),
+)
 
 
 @dataclass
@@ -42,7 +46,7 @@ def lines(machine: str) -> dict[tuple[str, str], Row]:
         seeds = own.get((task, learner), [])
         if len(seeds) > 2 and len({row["trained on"] for row in seeds}) == 1:
             total = next((row["in all (s)"] for row in seeds if row["seed"] == "1"), "")
-            shown: Row = {**paper.line(seeds), "in all (s)": total, "on": ""}
+            shown: Row = {**paper.line(seeds), "in all (s)": f"{float(total):.0f}" if total else ""}
             found[task, learner] = {**shown, "training (s)": paper.seconds(shown)}
     return found
 
@@ -108,7 +112,7 @@ def races() -> Iterator[Panel]:
     """What MuJoCo says of checkpoints along trainings: each seed."""
     for file, column, task, y in RACES:
         rows, drawn = read_csv(common.RESULTS / "cpu" / f"{file}.csv"), list[Line]()
-        rows = [row for row in rows if "_shared/" not in row["checkpoint"]]
+        rows = [row for row in rows if row["task"] == task and "_shared/" not in row["checkpoint"]]
         for (learner, _), own in grouped(rows, "learner", "seed").items():
             own.sort(key=lambda row: float(row["training s"]))
             script = "ppo_4096" if learner.startswith("ppo") else learner.partition(" ")[0]
@@ -117,20 +121,11 @@ def races() -> Iterator[Panel]:
         yield Panel(drawn, task, "seconds of training", y, "xy" if column == "error" else "x")
 
 
-def commands() -> list[Row]:
-    """The flags of learners that are a script with some."""
-    found = {learner: LEARNERS[learner].partition(" ") for learner in SHOWN}
-    return [
-        {"learner": name, "command": f"`{script}.py {flags}`"} for name, (script, _, flags) in found.items() if flags
-    ]
-
-
 def main(args: Args) -> None:
     on_gpu = gpu()
     args.publish("why", markdown([*compared(on_gpu)]), README)
     args.publish("gpu", markdown([*on_gpu.values()], COLUMNS), PAGE)
     args.publish("cpu", markdown([*lines("cpu").values()], COLUMNS), PAGE)
-    args.publish("commands", markdown(commands()), PAGE)
     grid = [*panels(GPUS), *races()]
     plot(args.picture("benchmarks"), [grid], (3.4, 2.6))
     plot(args.picture("benchmarks_cpu"), [panels(("cpu",))], (3.4, 2.6))

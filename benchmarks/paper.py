@@ -1,4 +1,4 @@
-"""The results of docs/experiments.md as one list of cells: a learner on a task with a seed, trained to its end, alone.
+"""The paper's results as one list of cells: a learner on a task with a seed, trained to its end, alone.
 
     python benchmarks/paper.py --check                             what is missing
     python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables
@@ -221,30 +221,24 @@ def table(args: Args, name: str) -> list[Row]:
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
             own = [row for row in own if int(row["seed"]) <= seeds and cells.counts(row, group.timed)]
             if len(own) == seeds and len({row["trained on"] for row in own}) == 1:
-                lines.append({**line(own), **total.get((learner, task), {"in all (s)": ""})})
+                lines.append({**line(own), "in all (s)": total.get((learner, task), "")})
     return lines
 
 
-def totals(args: Args, group: Group) -> dict[tuple[str, str], Row]:
-    """In all (s) of seed 1 by learner and task; "on" another GPU, if it was trained there as well for its seconds."""
-    found, machines = dict[tuple[str, str], Row](), args.directory.parent
-    others = {path.parent.name for path in machines.glob("*/cells.csv")} - {"cpu", group.machine}
-    for place in (group.machine, *sorted(others if group.machine != "cpu" else ())):
-        for row in read_csv(machines / place / "cells.csv"):
-            if row["seed"] == "1" and row["in all (s)"] and cells.counts(row, group.timed):
-                total = {"in all (s)": f"{float(row['in all (s)']):.0f}", "on": "" if place == group.machine else place}
-                found[row["learner"], row["task"]] = total
-    return found
+def totals(args: Args, group: Group) -> dict[tuple[str, str], str]:
+    """In all (s) of seed 1 by learner and task."""
+    rows = read_csv(args.directory.parent / group.machine / "cells.csv")
+    rows = [row for row in rows if row["seed"] == "1" and row["in all (s)"] and cells.counts(row, group.timed)]
+    return {(row["learner"], row["task"]): f"{float(row['in all (s)']):.0f}" for row in rows}
 
 
 def seconds(row: Row) -> str:
     """Of the training, marked if computed from the time of an iteration, and in all, from the command to its end."""
-    whole = f" ({row['in all (s)']} {row['on']}".rstrip() + ")" if row["in all (s)"] else ""
-    return f"{row['training (s)']}{row['paced']}{whole}"
+    return f"{row['training (s)']}{row['paced']}" + (f" ({row['in all (s)']})" if row["in all (s)"] else "")
 
 
 def printed(args: Args, name: str) -> str:
-    """A group's table: a line for each learner and task or, without seconds, for each task.
+    """A group's table: a line for each learner and task, or for each task the ratio of two learners.
 
     A task that has a single learner is left out: it compares nothing.
     """
@@ -252,15 +246,7 @@ def printed(args: Args, name: str) -> str:
         return markdown(ratios(args, name))
     rows = table(args, name)
     count = Counter(row["task"] for row in rows)
-    rows = [{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1]
-    if GROUPS[name].timed:
-        return markdown(rows, TIMED)
-    lines = dict[object, dict[str, object]]()
-    for row in rows:
-        of_task = lines.setdefault(row["task"], {"task": row["task"]})
-        of_task[str(row["learner"])] = f"{row['return']}<br>{row['steps to target']}"
-    columns = [learner for learner in GROUPS[name].learners if any(learner in each for each in lines.values())]
-    return markdown([*lines.values()], ("task", *columns))
+    return markdown([{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1], TIMED)
 
 
 def check(args: Args) -> str:

@@ -24,7 +24,7 @@ import tyro
 import warp as wp
 from cells import ScriptFlags
 from common import Part, measured, run
-from speed import timed, windows
+from speed import rollouts, timed
 from tables import Row, read_csv
 from torch import Tensor
 from worlds import FASTEST, MuJoCo, mujoco_model
@@ -42,7 +42,7 @@ ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64)
 ROOM |= {"humanoid": (64, 256), "go1": (16, 96), "go2": (16, 96), "g1": (24, 192), "g1_track": (24, 192)}
 PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
 EVERY: tuple[Name, ...] = ("ant", "humanoid", "go2", "g1")
-HORIZON = 32  # control steps of a timed window
+HORIZON = 32  # control steps of a timed rollout
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Args(ScriptFlags):
     env: Annotated[tuple[Name, ...], tyro.conf.arg(help="tasks")] = EVERY  # type: ignore[assignment]
     parts: tuple[PartName, ...] = ("speed",)  # what to measure
     num_envs: tuple[Count, ...] = (64, 1024, 4096)  # batch sizes of the speed
-    repeats: Count = 10  # windows of 32 control steps; the fastest counts
+    repeats: Count = 10  # rollouts of 32 control steps; the fastest counts
     seed: int = 1  # seed of the training, which writes to {runs}/ppo_mujoco_warp/{env}__{seed}
     seconds: Positive = 100.0  # of training, after which it stops and saves
 
@@ -115,7 +115,7 @@ def measure_speed(args: Args, name: Name) -> Iterator[Row]:
         for action in first:
             env.step(action)
         peer, start = MuJoCoWarp(env.sim, name), (env.qpos, env.qvel, actions.requires_grad_())
-        (theirs, *_), (forward, _, both) = windows(peer, *start), windows(env.sim, *start)
+        (theirs, *_), (forward, _, both) = rollouts(peer, *start), rollouts(env.sim, *start)
         calls = theirs, *(graph.capture(call, env.device) for call in (forward, both))
         other, here, backward = (HORIZON * num_envs / timed(call, env.device, 3, args.repeats) for call in calls)
         row = {"task": name, "environments": num_envs, "mj_step": mj_steps(env.sim, *start[:2], first)}
@@ -175,7 +175,7 @@ TRAIN = "task", "seed", "control steps", "training (s)", "control steps/s", "ret
 
 PARTS = {
     "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", columns=SPEED),
-    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", columns=TRAIN),
+    "train": Part("peer_train", train, ("task", "seed"), columns=TRAIN),
 }
 
 

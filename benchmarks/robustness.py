@@ -42,6 +42,7 @@ TRUNK = 1  # the pushed body: the robot's first
 @dataclass
 class Args(common.CheckpointFlags):
     num_envs: Count = 64  # robots that begin to walk
+    own: str | None = None  # FILE:CLASS of the policies' own task, whose code runs
 
 
 class Walkers(NamedTuple):
@@ -107,7 +108,7 @@ def smallest(share: Callable[[float], float], first: float) -> float:
 
 def load(args: Args, path: Path) -> Case:
     """The policy; one that cannot be pushed over ends the benchmark with one line."""
-    case = load_case(path, args.num_envs, args.device)
+    case = load_case(path, args.num_envs, args.device, args.own)
     if not case.env.task.falls():
         fail(f"{case.path} was trained on {case.env.task.name}, whose episodes do not end with a fall")
     if isinstance(case.env.task, HumanoidImitation) and not case.env.task.clip.loop:

@@ -160,7 +160,7 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
             yield row | {"mj_step, one core (us/substep)": mj / substeps, "mj_step/forward": mj / t["forward"]}
 
 
-# Windows of control steps --------------------------------------------------------------------------------------------
+# Rollouts of control steps --------------------------------------------------------------------------------------------
 
 
 def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: int) -> float:
@@ -175,7 +175,7 @@ def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: 
     return min(seconds)
 
 
-def windows(
+def rollouts(
     sim: Simulator, qpos: torch.Tensor, qvel: torch.Tensor, actions: torch.Tensor
 ) -> tuple[Callable[[], torch.Tensor], ...]:
     """Control steps with actions (H, N, nu) from a state: without gradients, differentiably, with the backward pass."""
@@ -191,7 +191,7 @@ def windows(
 
 
 def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
-    """A window of control steps differentiably, and with its backward pass; without what needs too much memory."""
+    """A rollout of control steps differentiably, and with its backward pass; without what needs too much memory."""
     settings = dict.fromkeys([(n, 32) for n in SCALING] + [(64, h) for h in HORIZONS])
     if args.device == "cpu":
         fail("--parts scaling needs a GPU: --device cuda")
@@ -212,7 +212,7 @@ def scaling_row(device: str, name: TaskName, num_envs: int, horizon: int, techni
     division = (1, 1) if "one thread" in technique else None
     sim = Simulator(env.scene, num_envs, default, horizon=horizon, device=device, division=division)
     actions = (torch.rand(horizon, num_envs, sim.nu, device=env.device) * 2 - 1).requires_grad_()
-    calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]
+    calls = rollouts(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]
     captured = [graph.capture(call, env.device) if "graph" in technique else call for call in calls]
     one_way, both = (timed(call, env.device, warmup=3, calls=4) for call in captured)
     row: dict[str, object] = {"task": name, "environments": num_envs, "horizon": horizon, "technique": technique}

@@ -150,35 +150,27 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
     ]
 
 
-def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
+def race(rows: list[dict[str, str]]) -> list[Row]:
     """Control steps and seconds of training until enough episodes succeed, for the first time and for two checkpoints
-    in a row, of a GPU's only trainings; or how those end that shared one."""
+    in a row, of a GPU's only trainings."""
     lines = list[Row]()
-    rows = [row | {"run": row["checkpoint"].partition("/")[0]} for row in rows]
+    rows = [row | {"run": row["checkpoint"].partition("/")[0]} for row in alone(rows)]
     for (name,), group in grouped(rows, "run").items():
-        if name.endswith("_shared") != shared:
-            continue
         group.sort(key=lambda row: int(row["iteration"]))
         enough = [row for row in group if float(row["success"]) >= ENOUGH]
         twice = [row for row, after in pairwise(group) if row in enough and after in enough]
-        line = {"training": name.removesuffix("_shared").partition("__")[0].replace("_", " ")}
-        if shared:
-            line["M steps"] = f"{float(group[-1]['control steps']) / 1e6:.3g}"
-        else:
-            line["joints (rad)"] = group[-1]["joint error"]
-            line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
-            for column, found in ((f"s to {ENOUGH:.0%}", enough), ("twice in a row (s)", twice)):
-                line[column] = found[0]["training s"] if found else "never"
-        line["last success"] = f"{float(group[-1]['success']):.0%}"
-        lines.append(line)
+        line = {"training": name.partition("__")[0].replace("_", " "), "joints (rad)": group[-1]["joint error"]}
+        line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
+        for column, found in ((f"s to {ENOUGH:.0%}", enough), ("twice in a row (s)", twice)):
+            line[column] = found[0]["training s"] if found else "never"
+        lines.append(line | {"last success": f"{float(group[-1]['success']):.0%}"})
     return lines
 
 
 def main(args: Args) -> None:
     key = (*ABOUT[:-1], "clip", "file", "friction", "push")
     if args.race:
-        rows = measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
-        print(markdown(race(rows, shared=True)))
+        measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
         return
     rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
     args.publish("many", markdown(many(rows)), PAGE)

@@ -84,9 +84,8 @@ def make(
         substeps, implicit, tolerance: replace parts of the preset, see Integration.
         penalty: constants of the penalty law that replace the MJCF's, e.g. {"k_n": 1e5}, see docs/physics.md.
         dtype: torch.float32 or torch.float64.
-        terrain: replaces the plane z = 0, or the task's own ground: vertices (x, z) [m] of one profile, (K, 2), or of
-            one for each environment, (N, K, 2), see Scene.with_terrain and diffsim.extra.terrain. The task then
-            measures heights from the ground below the root.
+        terrain: replaces the task's ground: vertices (x, z) [m] of one profile, (K, 2), or of one for each
+            environment, (N, K, 2), see docs/physics.md.
         control_dt: seconds of a control step. Default: the task's.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task reports a fall.
@@ -105,7 +104,7 @@ def make(
     Raises:
         ValueError: an argument out of range, with what is allowed; a kernel cache that cannot be written.
         TypeError: an argument with an unknown name.
-        SceneError, TaskError: both ValueErrors: a robot or a task that cannot be simulated.
+        SceneError, TaskError: a robot or a task that cannot be simulated.
     """
     if unknown:
         known = sorted(inspect.signature(make).parameters.keys() - {"unknown"})

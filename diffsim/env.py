@@ -271,14 +271,14 @@ class DiffEnv(VectorEnv):
         self._set_state(part.detach() for part in self._state())
         self.sim.rewind()
 
-    def pin_window(self) -> State:
+    def pin_rollout(self) -> State:
         """Copy the state into fixed buffers, from which a CUDA graph replays the rollout; see graph.py."""
         self._set_state(part.detach().clone() for part in self._state())
         self._pinned = self._state()
         return self._pinned
 
     def write_back(self, pinned: State) -> None:
-        """End a captured rollout: write the state back into the buffers that `pin_window` returned."""
+        """End a captured rollout: write the state back into the buffers that `pin_rollout` returned."""
         with torch.no_grad():
             for to, value in zip(pinned, self._state(), strict=True):
                 to.copy_(value)

@@ -21,7 +21,7 @@ from diffsim.training import Run, command
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
-# Windows of cartpole with a time-out on the way (240 steps), an evaluation before the end and one at it.
+# Rollouts of cartpole with a time-out on the way (240 steps), an evaluation before the end and one at it.
 _SMALL = (
     "--env cartpole --num-envs 3 --horizon 32 --iterations 10 --eval-every 4 --eval-episodes 3 --quiet --device cpu"
 ).split()

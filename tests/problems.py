@@ -21,7 +21,7 @@ Array = NDArray[Any]
 
 
 def lambda_returns(reward: Array, following: Array, done: Array, gamma: float, lam: float) -> Array:
-    """(T, N): of each step the weighted sum of all its n-step returns until the episode or the window ends.
+    """(T, N): of each step the weighted sum of all its n-step returns until the episode or the rollout ends.
 
     Args:
         following: (T, N) values of the states after the steps.

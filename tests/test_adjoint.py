@@ -48,8 +48,8 @@ def test_rows_alike_stay_and_a_huge_one_no_longer_dominates() -> None:
     assert torch.equal(clipped[others], weight[others].expand(-1, 7)) and clipped[4].isnan().all()
 
 
-def window(factor: float, scale: float = 1.0) -> torch.Tensor:
-    """The gradient (steps, N, nu) of a window of ants on MuJoCo's contact, where one environment counts more."""
+def rollout(factor: float, scale: float = 1.0) -> torch.Tensor:
+    """The gradient (steps, N, nu) of a rollout of ants on MuJoCo's contact, where one environment counts more."""
     env = diffsim.make("ant", num_envs=6, seed=0, horizon=6, contact="mujoco", adjoint_clip=factor)
     weight = torch.ones(6)
     weight[2] = scale
@@ -60,13 +60,13 @@ def window(factor: float, scale: float = 1.0) -> torch.Tensor:
 
 
 def test_a_window_of_an_environment() -> None:
-    plain = window(0.0)
-    assert torch.equal(window(1e6), plain)
-    huge, clipped = window(0.0, 1e6), window(5.0, 1e6)
+    plain = rollout(0.0)
+    assert torch.equal(rollout(1e6), plain)
+    huge, clipped = rollout(0.0, 1e6), rollout(5.0, 1e6)
     length = huge.norm(dim=(0, 2)), clipped.norm(dim=(0, 2))
     assert length[0][2] > 1e5 * length[0].median() and length[1][2] < 10 * length[1].median()
     others = [0, 1, 3, 4, 5]
-    torch.testing.assert_close(window(1e3, 1e6)[:, others], plain[:, others])
+    torch.testing.assert_close(rollout(1e3, 1e6)[:, others], plain[:, others])
 
 
 @torch.no_grad()

@@ -37,7 +37,7 @@ def test_loss_and_its_gradient_are_those_of_a_loop(rng, horizon):
 
 
 def test_gradient_is_the_finite_difference():
-    """Through a whole window of three ants of which one runs out of time."""
+    """Through a whole rollout of three ants of which one runs out of time."""
     torch.manual_seed(0)
     learner = build("ant", "--hidden", "16", "--horizon", "8", dtype=torch.float64)
     env, policy = learner.env, learner.actor
@@ -80,5 +80,5 @@ def test_a_window_as_long_as_the_episode_swings_the_pole_up_in_part(tmp_path):
     arguments = "--env cartpole --num-envs 16 --horizon 240 --iterations 8 --eval-episodes 1 --quiet"
     run(bptt, tmp_path, *arguments.split())
     rows = read_progress(tmp_path)
-    assert rows[0]["length"] == "240.0"  # every window holds a whole episode
+    assert rows[0]["length"] == "240.0"  # every rollout holds a whole episode
     assert float(rows[0]["return"]) < -2200 and float(rows[-1]["return"]) > -2000

@@ -296,7 +296,7 @@ def test_overwritten_checkpoint_is_noticed(rng):
 
 
 def test_steps_without_gradient_and_jacobians_leave_checkpoints_alone(rng):
-    """Jacobians take the next one of a window, for as long as they need it."""
+    """Jacobians take the next one of a rollout, for as long as they need it."""
     scene = task_scene("hopper")
     sim = Simulator(scene, 2, horizon=2)
     states = leaves(*acting_states(scene, 2, rng))
@@ -307,7 +307,7 @@ def test_steps_without_gradient_and_jacobians_leave_checkpoints_alone(rng):
     with torch.inference_mode():
         A, B = sim.jacobians(*states)
     torch.testing.assert_close(torch.autograd.grad(total, states, retain_graph=True), expected, rtol=0, atol=0)
-    total = total + sim.step(*states)[0].sum()  # in the same window
+    total = total + sim.step(*states)[0].sum()  # in the same rollout
     again = torch.autograd.grad(total, states)
     torch.testing.assert_close(again, tuple(2 * x for x in expected), rtol=0, atol=0)
     torch.testing.assert_close(A[:, :6].sum(1), torch.cat(expected[:2], 1), rtol=1e-4, atol=1e-4)

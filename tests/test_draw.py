@@ -54,14 +54,14 @@ def test_webp_plays_at_true_speed_for_ever(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one with a clock, both worlds above diagrams, and of one without, alone; a clip."""
+    """Of one with a clock, both worlds above diagrams, and of one without, which MuJoCo cannot move; a clip."""
     monkeypatch.setattr(draw, "FIGURES", tmp_path)
     draw.films((POLICIES / "go2.pt",), size=(96, 64))
-    draw.films((POLICIES / "ant.pt",), size=(96, 64), beside=False)
+    draw.films((POLICIES / "humanoid_mtu.pt",), size=(96, 64))
     draw.films((POLICIES / "g1_track.pt",), size=(96, 64))
     with Image.open(tmp_path / "g1_track.webp") as dance:
         assert dance.size == (2 * 96, 64) and dance.n_frames == 25 * draw.DANCE[1]  # type: ignore[attr-defined]
-    with Image.open(tmp_path / "go2.webp") as both, Image.open(tmp_path / "ant_here.webp") as one:
+    with Image.open(tmp_path / "go2.webp") as both, Image.open(tmp_path / "humanoid_mtu.webp") as one:
         assert both.size == (2 * 96, 64 + 12 + 4 * draw.ROW) and one.size == (96, 64)
         cycles = both.n_frames * Go2.control_dt * Go2.robot.cycle  # type: ignore[attr-defined]
         assert cycles == pytest.approx(round(cycles), abs=Go2.robot.cycle * Go2.control_dt)
@@ -69,3 +69,16 @@ def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     draw.batch(POLICIES / "go2.pt", count=4, seconds=0.2, size=(96, 64))
     with Image.open(tmp_path / "go2_batch.webp") as many:
         assert many.size == (96, 64) and many.n_frames == 5  # type: ignore[attr-defined]
+
+
+@pytest.mark.slow
+def test_films_of_commands_and_of_a_training(
+    opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(draw, "FIGURES", tmp_path)
+    draw.commands(POLICIES / "go2.pt", size=(96, 64))
+    assert ", whole" in capsys.readouterr().out
+    draw.learning("cartpole", marks=(0.5, 1.0), seconds=0.5, size=(96, 64))
+    with Image.open(tmp_path / "go2_commands.webp") as one, Image.open(tmp_path / "cartpole_learning.webp") as two:
+        assert one.size == (96, 64) and one.n_frames == round(draw.END * 25)  # type: ignore[attr-defined]
+        assert two.size == (2 * 96, 64) and two.n_frames == 15  # type: ignore[attr-defined]

@@ -141,7 +141,7 @@ def test_reset_begins_a_window_and_keeps_its_seed():
     assert info == {} and env.episode_step.tolist() == [0, 0, 0] and env.np_random_seed == 5
     assert_same(env.qpos, diffsim.make("hopper", num_envs=3, seed=5).qpos)
     env.step(actions[1])
-    (gradient,) = torch.autograd.grad(env.step(actions[2])[0].sum(), actions)  # of a window of two
+    (gradient,) = torch.autograd.grad(env.step(actions[2])[0].sum(), actions)  # of a rollout of two
     assert (gradient[0] == 0).all() and (gradient[1:] != 0).any()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ from typing import Any
 
 import common
 import gymnasium
+import identification
 import mujoco
 import numpy as np
 import pytest
@@ -26,7 +28,10 @@ from learners import PATH, ROOT
 from scenes import with_motors
 
 import diffsim
+from diffsim import load_scene
 from diffsim.extra.commands import POLICIES, main
+from diffsim.extra.parameters import ParametricSimulator
+from diffsim.tasks.base import ASSETS
 from diffsim.training import load_policy
 
 EXAMPLES = ROOT / "examples"
@@ -77,19 +82,43 @@ def test_own_learner() -> None:
     assert all(part.grad.norm() > 0 for part in policy.parameters())
 
 
-@pytest.mark.parametrize("truth", [{"mu": 0.7, "mass": 1.2}, {"mu": 0.5, "mass": 0.85}])
-def test_system_identification(truth: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a robot that MuJoCo simulates, at its own time step."""
-    module = load("system_identification")
-    monkeypatch.setattr(module, "TRUTH", truth)
-    sim = diffsim.make("hopper", 128, horizon=module.STEPS, contact="mujoco", factors=True).sim
-    recording = module.record(diffsim.make("hopper", 20))
-    assert [x.shape for x in recording] == [(20, 120, 6), (20, 120, 6), (20, 120, 3)]
-    torch.manual_seed(0)
-    estimates = module.identify(sim, recording)
-    assert estimates.shape == (13, 2) and estimates[0].tolist() == [1, 1]
-    for estimate, factor in zip(estimates[-1].tolist(), truth.values(), strict=True):
-        assert estimate == pytest.approx(factor, rel=0.05)
+@pytest.mark.parametrize("names, only", [(("mass", "damping", "armature"), ()), (("friction",), ("floor",))])
+def test_identify(
+    names: tuple[str, ...], only: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a hopper that MuJoCo moves. Of two geoms the larger friction counts, so a smaller one would not be found."""
+    module, log = load("identify"), tmp_path / "log.csv"
+    sim = ParametricSimulator(load_scene(ASSETS / "hopper.xml"), 1, diffsim.Integration("mujoco", 1))
+    unknowns = module.Unknowns(sim, names, only)
+    true = 0.5 * torch.randn(len(unknowns.labels), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    true = true if "mass" in names else true.abs()
+    sim.parameters = unknowns.values(true)
+    identification.write_log(log, sim)
+    module.main(ASSETS / "hopper.xml", log, names, only)
+    rows, printed = tables.read_csv(tmp_path / "log.fit.csv"), capsys.readouterr().out
+    assert len(rows) == (16 if "mass" in names else 1) and f"of {len(rows)} combinations of these numbers" in printed
+    truths = unknowns.numbers(true)
+    before, after = (
+        [abs(math.log(float(row[column]) / truth)) for row, truth in zip(rows, truths, strict=True)]
+        for column in ("file", "fitted")
+    )
+    assert np.median(before) > 0.2 and max(after) < 0.03
+    assert max(float(row["deviation"]) for row in rows) < 0.02
+
+
+def test_identify_tells_what_is_wrong_in_one_line(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("time,qpos0\n0,1\n1,2\n")
+    for flags, message in (
+        ([], "log.csv: must have columns of numbers: time and (6, 6, 3) of qpos, qvel and ctrl"),
+        (["--fit", "weight"], "unknown parameter 'weight'; choose from mass, com"),
+        (["--fit", "mass", "--only", "arm"], "there is no mass that moves the robot"),
+    ):
+        if flags:
+            log.write_text("\n".join(["time", *(",".join([str(k), *["0"] * 15]) for k in range(9))]))
+        command = [sys.executable, str(EXAMPLES / "identify.py"), str(ASSETS / "hopper.xml"), str(log), *flags]
+        done = subprocess.run(command, capture_output=True, text=True, env=os.environ | PATH)
+        assert done.returncode == 1 and message in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_landscape(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,10 +129,22 @@ def test_landscape(tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         module.measure(module.Args(points=points, trajectories=3), tiny_run / "checkpoint.pt") for points in (3, 5)
     )
     assert few == many[::2] and [row["change"] for row in few] == [-1.0, 0.0, 1.0]
-    assert all(len({row[loss] for row in many}) == 5 for loss in ("long", "window"))
+    assert all(len({row[loss] for row in many}) == 5 for loss in ("long", "rollout"))
     assert module.lowest([3.0, 1.0, 2.0, 0.0, 5.0]) == [0, 1, 0, 1, 0]
     module.main(module.Args(checkpoints=(tiny_run,), points=3, trajectories=3, output=tmp_path))
     assert len(tables.read_csv(tmp_path / "landscape.csv")) == 3 and (tmp_path / "landscape.png").is_file()
+
+
+def test_particles_begin_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = load("particles")
+    monkeypatch.setattr(module, "EVERY", 1)
+    monkeypatch.setattr(module, "SETTING", "--num-envs 4 --horizon 8 --minibatch-size 32 --epochs 1")
+    module.main(module.Args(iterations=1, output=tmp_path))
+    first, _, second, last = tables.read_csv(tmp_path / "particles.csv")
+    assert (first["control steps"], second["control steps"]) == ("0", "32")
+    assert (first["lowest"], first["highest"], first["moved"]) == ("-1", "1", "0")
+    assert second["median deviation"] != first["median deviation"] and last["joint"] == module.JOINTS[1]
+    assert (tmp_path / "particles.png").is_file()
 
 
 def test_bandit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,9 +162,7 @@ def test_bandit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("opengl")
 def test_pictures(tmp_path: Path) -> None:
     """Those of docs/gymnasium.md."""
-    load("system_identification").main(tmp_path / "found.png")
     load("trajectory_optimisation").optimise(guesses=2, iterations=1, video=tmp_path / "swing_up.gif")
-    assert (tmp_path / "found.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "swing_up.gif").stat().st_size > 10_000
     with pytest.raises(ValueError, match="a video ends in"):
         load("trajectory_optimisation").optimise(video=tmp_path / "swing_up.avi")

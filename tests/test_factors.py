@@ -82,7 +82,7 @@ def test_gradients_of_welded_bodies_are_those_of_differences(rng):
 
 
 def test_each_environment_and_step_has_its_own(rng):
-    """Steps of a window see what was written in place before them, and so do their adjoints."""
+    """Steps of a rollout see what was written in place before them, and so do their adjoints."""
     scene, states = grounded_leg(2, rng)
     sim = Simulator(scene, 2, SETTINGS[0], horizon=2, dtype=torch.float64, **BOTH)
     q, v, u = (torch.tensor(x, requires_grad=True) for x in states)
@@ -103,7 +103,7 @@ def test_each_environment_and_step_has_its_own(rng):
 
 
 def test_gradients_reach_a_tensor_through_the_environment():
-    """A whole window's, in the logarithms of one set of factors, and one force on the torso, for all."""
+    """A whole rollout's, in the logarithms of one set of factors, and one force on the torso, for all."""
     count = len(FACTORS)
 
     def total(given):

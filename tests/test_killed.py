@@ -21,15 +21,15 @@ from diffsim.training import Run
 
 pytestmark = pytest.mark.slow
 COMMON = "--env cartpole --device cpu --iterations 6 --eval-every 4 --eval-episodes 2 --quiet --threads 1"
-WINDOWS = "--env cartpole:motor=0.7:1.3,mass=0.5:2 --num-envs 6 --horizon 16"
+ROLLOUTS = "--env cartpole:motor=0.7:1.3,mass=0.5:2 --num-envs 6 --horizon 16"
 REPLAY = "--num-envs 5 --steps 8 --buffer-size 2000 --batch-size 32 --hidden 16 16"
 FLAGS = {
-    "shac": f"{WINDOWS} --critic-iterations 2",
-    "rpo": f"{WINDOWS} --critic-iterations 2 --epochs 2",
-    "sapo": f"{WINDOWS} --critic-iterations 2 --population 3",
-    "bptt": WINDOWS,
-    "ppo_baseline": f"{WINDOWS} --minibatch-size 40 --epochs 2",
-    "pfpn": f"{WINDOWS} --minibatch-size 40 --epochs 2 --particles 7",
+    "shac": f"{ROLLOUTS} --critic-iterations 2",
+    "rpo": f"{ROLLOUTS} --critic-iterations 2 --epochs 2",
+    "sapo": f"{ROLLOUTS} --critic-iterations 2 --population 3",
+    "bptt": ROLLOUTS,
+    "ppo_baseline": f"{ROLLOUTS} --minibatch-size 40 --epochs 2",
+    "pfpn": f"{ROLLOUTS} --minibatch-size 40 --epochs 2 --particles 7",
     "pods": "--num-envs 5 --horizon 16 --candidates 3 --epochs 2 --batch-size 32 --order 2",
     "gps": "--horizon 30 --pretraining 20 --hidden 8 --samples 4 "
     "--guiding-samples 8 --active 16 --lbfgs-iterations 4 --adaptive 1 --adaptive-iterations 2",

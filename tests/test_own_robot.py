@@ -22,7 +22,8 @@ from diffsim.tasks.base import ASSETS
 from diffsim.training import checkpoint, load_policy, parse
 
 PAGE = (ROOT / "docs" / "own_robot.md").read_text()
-LISTING, SNIPPET = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+(LISTING,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+(MADE,) = re.findall(r"`(diffsim\.make\(.*?\))`", PAGE)
 COMMANDS = [
     line.split()[1:] for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.M | re.S) for line in block.splitlines()
 ]
@@ -88,7 +89,7 @@ def test_the_snippet_runs(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And the class itself makes the same environment."""
     monkeypatch.chdir(home)
     names: dict[str, object] = {}
-    exec(SNIPPET, names)
+    exec(f"import diffsim\nenv = {MADE}", names)
     env = names["env"]
     assert isinstance(env, diffsim.DiffEnv) and (env.num_envs, env.task.obs_dim) == (16, 9)
     envs = [diffsim.make(task, 3, seed=1) for task in ("examples/own_robot.py:RunForward", type(env.task))]

@@ -329,7 +329,7 @@ def test_nothing_is_moved(script: Any, case: str, flags: str, dead: int) -> None
 
 @pytest.mark.parametrize(("by", "moved"), [("mean", 2), ("max", 1)])
 def test_what_makes_a_particle_dead(by: str, moved: int) -> None:
-    """By its largest weight (Eq. 8) it is alive if it has weight in one of the recorded states, of any window."""
+    """By its largest weight (Eq. 8) it is alive if it has weight in one of the recorded states, of any rollout."""
     own, moving, optimizer, features = head("--dead-by", by, "--resampling-interval", "2")
     kill(own, [(0, 1), (2, 3)])
     features[:, 0] = 0.0

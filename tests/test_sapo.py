@@ -22,7 +22,7 @@ PLAIN = ("--no-entropy", "--no-state-std", "--critics", "1", "--activation", "el
 
 
 def build(task: str, *arguments: str, num_envs: int = 4, dtype: torch.dtype = torch.float32) -> Any:
-    """The algorithm on a few environments and windows of eight steps; in float64 not to be optimised."""
+    """The algorithm on a few environments and rollouts of eight steps; in float64 not to be optimised."""
     args = parse(sapo.Args, ["--env", task, "--horizon", "8", "--device", "cpu", *arguments])
     learner = sapo.SAPO(args, diffsim.make(task, num_envs=num_envs, seed=0, horizon=args.horizon, dtype=dtype))
     for module in vars(learner).values():

@@ -28,7 +28,7 @@ def random_rollout(rng: np.random.Generator, horizon: int = 12, num_envs: int = 
 
 
 def build(task: str, *arguments: str, dtype: torch.dtype = torch.float32) -> shac.SHAC:
-    """The algorithm on three environments and windows of eight steps; in float64 not to be optimised."""
+    """The algorithm on three environments and rollouts of eight steps; in float64 not to be optimised."""
     args = parse(shac.Args, ["--env", task, "--horizon", "8", "--device", "cpu", *arguments])
     learner = shac.SHAC(args, diffsim.make(task, num_envs=3, seed=0, horizon=args.horizon, dtype=dtype))
     for module in (learner.actor, learner.critic, learner.target):
@@ -61,7 +61,7 @@ def test_actor_loss_and_its_gradient_are_those_of_a_loop(rng: np.random.Generato
             loss = loss - discount * rollout.reward[t, i]
             discount *= GAMMA
             if (rollout.done[t, i] or t == horizon - 1) and not rollout.terminated[t, i]:
-                # The episode timed out, or the window ends; a terminated one has no value.
+                # The episode timed out, or the rollout ends; a terminated one has no value.
                 loss = loss - discount * learner.target(normalizer(rollout.next_obs[t, i]))[0]
             if rollout.done[t, i]:
                 discount = 1.0

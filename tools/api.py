@@ -12,13 +12,13 @@ import diffsim
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 HEAD = """# API
 
-`python tools/api.py` writes this page from docstrings. N is the number of environments. `SceneError`
-and `TaskError` are `ValueError`s.
+`python tools/api.py` writes this page from docstrings; `help` prints all of them. N is the number of environments.
+`SceneError` and `TaskError` are `ValueError`s.
 """
-NAMES = "make DiffEnv Simulator Integration Task load_scene".split()
+NAMES = "make DiffEnv Simulator Task".split()
 FULL = "step reset detach set_state jacobians".split()  # methods of DiffEnv and Simulator, printed with all they say
 # Methods that few programs need
-INTERNAL = """pin_window write_back take_statistics advance check_tensor tangent check load_robot scene bind presets
+INTERNAL = """pin_rollout write_back take_statistics advance check_tensor tangent check load_robot scene bind presets
 integration falls has_mirror configured terrain stored restored over ghost disturb observe_with""".split()
 
 
@@ -56,8 +56,7 @@ def page() -> str:
         thing, kind = getattr(diffsim, name), isinstance(getattr(diffsim, name), type)
         doc = re.sub(r"\n\nExample:\n.*?(?=\n\n\w)", "", inspect.getdoc(thing) or "", flags=re.DOTALL)
         doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
-        call = f"({signature(thing)})" if name in ("Integration", "load_scene") else ""
-        parts.append(f"## {name}\n\n```python\ndiffsim.{name}{call}\n```\n\n```text\n{doc}\n```\n")
+        parts.append(f"## {name}\n\n```python\ndiffsim.{name}\n```\n\n```text\n{doc}\n```\n")
         for method in full(thing) if isinstance(thing, type) else ():
             each = getattr(thing, method)
             parts.append(f"### {name}.{method}({signature(each)})\n\n```text\n{inspect.getdoc(each)}\n```\n")

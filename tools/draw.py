@@ -4,6 +4,8 @@
     python tools/draw.py films diffsim/policies/go2.pt
     python tools/draw.py gait runs/<run>/checkpoint.pt --start 2 --every 0.1 --frames 8
     python tools/draw.py batch diffsim/policies/go2.pt
+    python tools/draw.py commands diffsim/policies/go2.pt
+    python tools/draw.py learning ant --marks 5 15 60
 
 A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own contact on the file of the robot, from
 the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
@@ -16,8 +18,9 @@ drawn as a ghost. The gait is that of the first of a few random episodes that la
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import mujoco
@@ -31,17 +34,19 @@ from tyro.conf import Positional
 from diffsim import Scene
 from diffsim.extra.commands import DEMO_EPISODES, POLICIES
 from diffsim.extra.gait import TOUCHING, contact_bodies, trace
-from diffsim.extra.render import Frame, Renderer, drawable, whole_file
+from diffsim.extra.render import BLUE, RED, Arrow, Frame, Renderer, drawable, whole_file
 from diffsim.extra.robots.imitation.tracking import Tracking
 from diffsim.extra.robots.joystick import Joystick
 from diffsim.extra.watch import make_policy_env
 from diffsim.training import command, evaluate, fail, load_policy
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from common import Case, load_case  # noqa: E402
-from worlds import Here, MuJoCo, World, in_double, rollout, starts  # noqa: E402
+from cells import Cell, Runner, ScriptFlags  # noqa: E402
+from common import RESULTS, Case, load_case  # noqa: E402
+from tables import ROOT, read_csv  # noqa: E402
+from worlds import Here, MuJoCo, State, World, in_double, rollout, starts  # noqa: E402
 
-FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
+FIGURES = ROOT / "docs" / "figures"
 # How many times closer than the robot's camera, and at which share of that one's height the picture's middle is.
 CLOSER = {
     "cartpole": (1.6, 0.38),
@@ -58,6 +63,18 @@ FLOOR, AROUND = 4.0, 4.8  # m after which the floor repeats; s that a robot with
 DANCE = 12.6, 5.0  # s of the clip that a film of tracking begins with, and how many it shows
 LEAST_FPS, QUALITY = 25.0, 40  # of a film; WebP's, of 100
 SPACING = 1.5  # m between the robots of a batch
+# Seconds from which a film of commands has each one, as shares of the robot's largest, and what it is called
+COMMANDS = (
+    (0.0, (0.0, 0.0, 0.0), "stand"),
+    (0.6, (1.0, 0.0, 0.0), "forward"),
+    (2.6, (0.5, 0.0, 1.0), "turn left"),
+    (3.5, (0.0, -1.0, 0.0), "to the right"),
+    (5.1, (-0.7, 0.0, 0.0), "backward"),
+    (6.5, (0.5, 0.0, -1.0), "turn right"),
+    (7.4, (0.0, 0.0, 0.0), "stand"),
+)
+# Seconds before which the root's velocity changes [m/s], how long this is shown, and when the film ends
+PUSHES, SHOWN, END = ((1.6, (-0.7, 0.7)), (4.2, (0.7, 0.7)), (5.8, (-0.7, -0.7))), 0.4, 8.2
 ROW, LABELS = 16, 56  # pixels of a foot's line in the diagram, and of its name
 INK, PAPER, PALE = (40, 46, 58), (255, 255, 255), (226, 230, 236)
 
@@ -80,7 +97,6 @@ def films(
     size: tuple[int, int] = (480, 320),
     start: float = 2.0,
     seconds: tuple[float, float] = (4.0, 5.0),
-    beside: bool = True,
 ) -> None:
     """A film of each policy, called as its task.
 
@@ -89,7 +105,6 @@ def films(
         size: width and height of a world's picture in pixels.
         start: seconds into the episode before which no loop begins.
         seconds: shortest and longest loop, unless the robot has a clock; what is shown from its start takes 4 s.
-        beside: show MuJoCo, too; without it the file is called <task>_here.webp.
     """
     for checkpoint in checkpoints or [POLICIES / f"{task}.pt" for task in CLOSER]:
         case = load_case(checkpoint, DEMO_EPISODES, "cpu")
@@ -100,7 +115,7 @@ def films(
         if tracks:  # of the clip, from its beginning on
             case.env.stochastic_init = False
             start, longest = DANCE
-        sides = motions(case, round((start + longest + 2.0) / dt), every, beside)
+        sides = motions(case, round((start + longest + 2.0) / dt), every)
         if tracks:
             sides = {name: motion.part(round(start * fps), round(longest * fps)) for name, motion in sides.items()}
             pictures = {name: drawn(case, motion, size) for name, motion in sides.items()}
@@ -121,11 +136,13 @@ def films(
                 below = diagrams(case.env.scene, sides[name].qpos, size[0])
                 shown[name] = [np.concatenate(both) for both in zip(frames, below, strict=True)]
         frames = [np.concatenate(row, axis=1) for row in zip(*shown.values(), strict=True)]
-        path = save_webp(FIGURES / f"{task.name}{'' if beside else '_here'}.webp", frames, fps)
+        path = save_webp(FIGURES / f"{task.name}.webp", frames, fps)
         print(f"{path}, {len(frames) / fps:.2f} s, {fps:.0f} frames/s, {path.stat().st_size / 1000:.0f} kB")
 
 
-def drawn(case: Case, motion: Motion, size: tuple[int, int]) -> list[Frame]:
+def drawn(
+    case: Case, motion: Motion, size: tuple[int, int], arrows: Sequence[Sequence[Arrow]] | None = None
+) -> list[Frame]:
     """Pictures as near as CLOSER says, drawn with twice as many pixels a side: smooth edges."""
     zoom, middle = CLOSER.get(case.env.task.name, (1.0, 0.5))
     width, height, wide, high = *size, *(round(2 * zoom * side) for side in size)
@@ -133,8 +150,13 @@ def drawn(case: Case, motion: Motion, size: tuple[int, int]) -> list[Frame]:
     with Renderer(case.env.scene, wide, high) as renderer:
         ghosts = [None] * len(motion.qpos) if motion.ghost is None else motion.ghost
         rows = zip(motion.qpos, motion.action, ghosts, strict=True)
-        speed = FLOOR / stride(case.env.task) if isinstance(case.env.task, Joystick) else 0.0  # forward, the command
-        whole = (renderer.draw(qpos, action, ghost=ghost, arrow=speed) for qpos, action, ghost in rows)
+        if arrows is None:  # the command of a film, forward
+            speed = FLOOR / stride(case.env.task) if isinstance(case.env.task, Joystick) else 0.0
+            arrows = [[((speed, 0.0), RED)]] * len(motion.qpos)
+        whole = (
+            renderer.draw(qpos, action, ghost=ghost, arrows=own)
+            for (qpos, action, ghost), own in zip(rows, arrows, strict=True)
+        )
         return [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in whole]
 
 
@@ -143,8 +165,9 @@ def stride(task: Joystick) -> float:
     return round(AROUND * task.robot.cycle) / task.robot.cycle
 
 
-def motions(case: Case, steps: int, every: int, beside: bool) -> dict[str, Motion]:
-    """A frame for `every` of so many control steps, of the episode of median return here, by the name of the world."""
+def motions(case: Case, steps: int, every: int, beside: bool = True) -> dict[str, Motion]:
+    """A frame for `every` of so many control steps, of the episode of median return here, by the name of the world:
+    this one, and MuJoCo beside it."""
     env, task, start, found, episode = case.env, in_double(case.env), starts(case.env, torch.float64), {}, -1
     worlds: dict[str, World] = {"diffsim": Here(env.sim)}
     if beside and "muscle" not in env.scene.features:
@@ -284,16 +307,113 @@ def batch(
     print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
 
 
+def commands(checkpoint: Positional[Path], size: tuple[int, int] = (480, 320)) -> None:
+    """A film of a robot in MuJoCo that follows one command after another (red) and is pushed (blue), called
+    <task>_commands.webp.
+
+    Args:
+        checkpoint: file of any script, trained on a joystick task.
+        size: width and height in pixels.
+    """
+    case = load_case(checkpoint, 1, "cpu")
+    if not isinstance(case.env.task, Joystick):
+        fail(f"{checkpoint} was trained on {case.env.task.name}, which follows no command")
+    task, dt, start = in_double(case.env), case.env.control_dt, starts(case.env, torch.float64)
+    most = torch.tensor(case.env.task.robot.command).double()
+
+    def command_of(step: int) -> tuple[NDArray[np.float64], str]:
+        share, text = next(entry[1:] for entry in reversed(COMMANDS) if entry[0] <= step * dt)
+        return (torch.tensor(share) * most).numpy(), text
+
+    def disturb(step: int, state: State) -> State:
+        command, _ = command_of(step)
+        state.memory[:, :3] = torch.from_numpy(command)
+        for at, change in PUSHES:
+            if step == round(at / dt):
+                state.qvel[:, :2] += torch.tensor(change)
+        return state
+
+    world = MuJoCo(case.env.scene, 1, dt, own_friction=True)
+    taken = [*rollout(world, task, case.saved.network, start, round(END / dt), disturb)]
+    every = max(1, int(1 / (LEAST_FPS * dt) + 1e-6))
+    qpos, action = (torch.stack([getattr(step.state, name)[0] for step in taken]) for name in ("qpos", "action"))
+    motion = Motion(qpos.numpy()[::every], action.numpy()[::every], bool(taken[-1].fallen))
+    arrows, texts = list[list[Arrow]](), list[str]()
+    for step, row in zip(range(0, len(taken), every), motion.qpos, strict=True):
+        command, text = command_of(step)
+        w, x, y, z = row[3:7]
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        ahead, aside = command[:2]
+        along = ahead * np.cos(yaw) - aside * np.sin(yaw), ahead * np.sin(yaw) + aside * np.cos(yaw)
+        pushed = [change for at, change in PUSHES if 0 <= step * dt - at < SHOWN]
+        arrows.append([(along, RED), *((change, BLUE) for change in pushed)])
+        texts.append(text + ", pushed by 1 m/s" * bool(pushed))
+    frames = [titled(frame, text) for frame, text in zip(drawn(case, motion, size, arrows), texts, strict=True)]
+    path = save_webp(FIGURES / f"{case.env.task.name}_commands.webp", frames, 1 / (every * dt))
+    print(
+        f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB, {'fallen' if motion.fallen else 'whole'}"
+    )
+
+
+def learning(
+    env: Positional[str] = "ant",
+    learner: str = "rpo",
+    marks: tuple[float, ...] = (5.0, 15.0, 60.0),
+    seconds: float = 4.0,
+    size: tuple[int, int] = (280, 240),
+) -> None:
+    """A film of what a learner's seed 1 on two CPU cores has learned after some seconds, called <task>_learning.webp.
+
+    It trains on this machine's CPU as many iterations as the training of results/cpu/cells.csv had in this time.
+
+    Args:
+        env: task to train.
+        learner: one of cells.csv.
+        marks: seconds of training.
+        seconds: length of the film, from the start of an episode on.
+        size: width and height of a policy's picture in pixels.
+    """
+    known = read_csv(RESULTS / "cpu" / "cells.csv")
+    row = next((row for row in known if (row["learner"], row["task"], row["seed"]) == (learner, env, "1")), None)
+    if row is None:
+        fail(f"{learner} on {env} is not in results/cpu/cells.csv")
+    pace, columns = float(row["training (s)"]) / int(row["iterations"]), list[list[Frame]]()
+    with TemporaryDirectory() as folder:
+        cell = Cell("cpu", learner, env, 1).case(Path(folder))
+        for mark in marks:
+            if not Runner(ScriptFlags(device="cpu")).train(cell, round(mark / pace)):
+                fail((cell.folder / "output.txt").read_text())
+            case = load_case(cell.folder, DEMO_EPISODES, "cpu")
+            dt, title = case.env.control_dt, f"after {mark:g} s"
+            every = max(1, int(1 / (LEAST_FPS * dt) + 1e-6))
+            (motion,) = motions(case, round(seconds / dt), every, beside=False).values()
+            if (x := case.env.task.forward_column) is not None:
+                title += f": {(motion.qpos[-1, x] - motion.qpos[0, x]) / seconds:.1f} m/s"
+            columns.append([titled(frame, title) for frame in drawn(case, motion, size)])
+    frames = [np.concatenate(row, axis=1) for row in zip(*columns, strict=True)]
+    path = save_webp(FIGURES / f"{env}_learning.webp", frames, 1 / (every * dt))
+    print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
+
+
 def halve(frame: Frame) -> Frame:
     """2 x 2 pixels into one: smooth edges."""
     height, width = frame.shape[0] // 2, frame.shape[1] // 2
     return frame.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).round().astype(np.uint8)
 
 
+FILMS: dict[str, Callable[..., None]] = {
+    "films": films,
+    "gait": gait,
+    "batch": batch,
+    "commands": commands,
+    "learning": learning,
+}
+
+
 @command
 def main() -> None:
     torch.set_num_threads(1)
-    tyro.extras.subcommand_cli_from_dict({"films": films, "gait": gait, "batch": batch}, description=__doc__)
+    tyro.extras.subcommand_cli_from_dict(FILMS, description=__doc__)
 
 
 if __name__ == "__main__":

@@ -22,12 +22,13 @@ from diffsim.robot.scene import Array, Scene
 from diffsim.tasks.base import ASSETS
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
+Arrow = tuple[Sequence[float], NDArray[np.float32]]  # a horizontal velocity [m/s] in world axes, and its colour
 
 AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.1, 1.0])  # colours of a muscle
 LOOKS = ASSETS / "looks"  # meshes that are drawn in place of a robot's primitives; tools/looks.py writes them
 GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
 GHOST = np.array([0.2, 0.6, 0.3, 0.35], dtype=np.float32)
-ARROW = np.array([0.84, 0.24, 0.16, 1.0], dtype=np.float32)
+RED, BLUE = np.array([[0.84, 0.24, 0.16, 1.0], [0.16, 0.4, 0.84, 1.0]], dtype=np.float32)  # of arrows
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
@@ -72,7 +73,7 @@ class Renderer(AbstractContextManager["Renderer"]):
         ctrl: ArrayLike | None = None,
         profile: int = 0,
         ghost: ArrayLike | None = None,
-        arrow: float = 0.0,
+        arrows: Sequence[Arrow] = (),
     ) -> Frame:
         """The frame (height, width, 3) of one configuration qpos (nq,).
 
@@ -80,7 +81,7 @@ class Renderer(AbstractContextManager["Renderer"]):
             ctrl: (nu,) in [-1, 1]; colours muscles by their activation, blue at rest, red at full force.
             profile: of which environment's terrain, if each has its own.
             ghost: another configuration (nq,) of the robot, which is drawn transparent.
-            arrow: velocity [m/s] along x, shown by an arrow in front of the robot; 0: none.
+            arrows: velocities beside the robot.
         """
         self._data.qpos[:] = qpos
         if ctrl is not None:
@@ -92,8 +93,8 @@ class Renderer(AbstractContextManager["Renderer"]):
         self._renderer.update_scene(self._data, self._camera)
         if self._terrain is not None:
             add_terrain(self._renderer.scene, self._terrain[profile % len(self._terrain)], self._material)
-        if arrow:
-            point(self._renderer.scene, self._data.xpos[1] + (0.25, 0.0, 0.2), arrow)
+        for arrow in arrows:
+            point(self._renderer.scene, self._data.xpos[1], arrow)
         if ghost is not None:
             self._data.qpos[:] = ghost
             mujoco.mj_kinematics(self.model, self._data)
@@ -193,11 +194,14 @@ def add_terrain(scene: mujoco.MjvScene, profile: Array, material: int) -> None:
         scene.ngeom += 1
 
 
-def point(scene: mujoco.MjvScene, place: Array, velocity: float) -> None:
-    """Add an arrow along x at a place (3,), 0.4 m long for 1 m/s."""
-    geom, end = scene.geoms[scene.ngeom], place + (0.4 * velocity, 0.0, 0.0)
-    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.eye(3).ravel(), ARROW)
-    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.02, place, end)
+def point(scene: mujoco.MjvScene, root: Array, arrow: Arrow) -> None:
+    """Add an arrow beside a root at a place (3,), 0.4 m long for 1 m/s."""
+    way, rgba = np.array((*arrow[0], 0.0)), arrow[1]
+    if (speed := float(np.linalg.norm(way))) == 0.0:
+        return
+    geom, start = scene.geoms[scene.ngeom], root + (0.25 / speed) * way + (0.0, 0.0, 0.2)
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
+    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.02, start, start + 0.4 * way)
     scene.ngeom += 1
 
 

@@ -30,6 +30,7 @@ from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.pairs import pair_rows
+from diffsim.kernels.parameters import parameter_adjoint
 from diffsim.kernels.solve import factor_solve
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -46,7 +47,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     lane, solve = lane_of(spec), factor_solve(spec)
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
-    muscle, constraint = muscle_law(spec), constraint_law(spec)
+    muscle, constraint, parameters = muscle_law(spec), constraint_law(spec), parameter_adjoint(spec)
     PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
     CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
     CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT, BASE_DAMPED = spec.has("contact motor clamp muscle limit base_damping")
@@ -58,7 +59,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.room
     # Local arrays have at least one element, also where they are not read.
     CONTACTS = max(spec.spheres, 1) + spec.pairs
-    NFACTORS, TENSIONS, BODIES = (len(FACTORS) if VARIED else 1), (NU if MUSCLE else 1), max(spec.forced, 1)
+    NFACTORS, LEARNED = spec.parameters or (len(FACTORS) if VARIED else 1), spec.parameters > 0
+    TENSIONS, BODIES = (NU if MUSCLE else 1), max(spec.forced, 1)
 
     @wp.func
     def load_vec3(a: t.array3, here: Lane, k: int):
@@ -189,7 +191,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
 
     @wp.func
     def joint_derivatives(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
-        """Differentiate the joint's force with respect to q and qd."""
+        """Differentiate the joint's force with respect to q and qd, and to that of its motors."""
         k = here.at + i
         end_qd = link.qd
         if wp.static(IMPLICIT and LIMIT):
@@ -199,17 +201,15 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             unclamped = own.unclamped
         derivatives = joint.derivatives(m, here, k, link.q, link.qd, end_qd, unclamped)
         if wp.static(VARIED and LIMIT):
-            if m.owned[k] == 1:  # of the lanes that have the joint
-                by = joint.limit_constants_derivatives(m, here, k, link.q, link.qd, end_qd)
-                adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * by[0]
-                adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - own.lam * by[1]
+            by = joint.limit_constants_derivatives(m, here, k, link.q, link.qd, end_qd)
+            adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * by[0]  # of one lane with the joint
+            adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - T(m.owned[k]) * own.lam * by[1]
         if wp.static(CONSTRAINED):
             con_derivatives = constraint.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
             derivatives = derivatives + vec2(con_derivatives[0], con_derivatives[1])
             if wp.static(VARIED):
-                if m.owned[k] == 1:
-                    adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * con_derivatives[2]
-        return derivatives
+                adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * con_derivatives[2]
+        return derivatives, unclamped
 
     @wp.func
     def inward(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints, adj_factors: Array):
@@ -230,7 +230,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     p = m.inboard[k]
                     turned = m.outboard[k]
                 own = nodes[i]
-                derivatives = joint_derivatives(m, here, i, ck, links[i], own, adj_factors)
+                derivatives, unclamped = joint_derivatives(m, here, i, ck, links[i], own, adj_factors)
                 S = links[i].S
                 total = adj[i]
                 xv = total.v - wp.spatial_cross_dual(links[p].V, total.a)
@@ -250,9 +250,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 nodes[i].gq = gq
                 xa = xv - wp.spatial_cross_dual(links[turned].V, total.a)
                 nodes[i].gqd = own.gqd + wp.dot(xa, S) - own.lam * derivatives[1]
-                unclamped = T(1.0)
-                if wp.static(CLAMP):
-                    unclamped = own.unclamped
                 nodes[i].gtau = own.gtau - unclamped * own.lam
                 if wp.static(NBALL > 0):
                     p = m.parent[k]
@@ -310,7 +307,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(MUSCLE):
             for entry in range(m.muscle_begin[here.lane], m.muscle_begin[here.lane + 1]):
                 failed = failed + block.is_nonfinite(adj_tension[m.muscle[entry]])
-        if wp.static(VARIED):
+        if wp.static(VARIED or LEARNED):
             for k in range(NFACTORS):
                 failed = failed + block.is_nonfinite(adj_factors[k])
         if wp.static(FORCED):
@@ -351,7 +348,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     adj_factors[MOTOR] = adj_factors[MOTOR] + g_force * motor
                     g_force = here.motor * g_force
                 write_gradient(g.ctrl, here.e, k, drop, g_force * T(m.gear[k]))
-        if wp.static(VARIED):
+        if wp.static(VARIED or LEARNED):
             for k in range(NFACTORS):
                 total = adj_factors[k]
                 if wp.static(THREADS_PER_ENV > 1):
@@ -446,6 +443,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(PAIRS):
                 pairs.correct_lambda(m, here, links, ck, contacts, nodes)
             partials(m, here, links, nodes, carrier, ck, adj, adj_factors)
+            if wp.static(LEARNED):
+                parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_factors)
             if wp.static(PAIRS):
                 pairs.add_adjoint(m, here, links, contacts, nodes, adj)
             if wp.static(FORCED):

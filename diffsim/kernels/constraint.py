@@ -46,6 +46,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     cone = pyramidal_cone(spec) if PYRAMID else elliptic_cone(spec)
     in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
+    LEARNED, COLUMNS = spec.parameters > 0, spec.parameters - 2 * spec.spheres  # see parameters.py
 
     @wp.func
     def impedance_row(c: Params, stiffness: T, r: T):
@@ -268,6 +269,10 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
                     adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
+                if wp.static(LEARNED):
+                    by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
+                    adj_factors[COLUMNS + 2 * c] = adj_factors[COLUMNS + 2 * c] - by_mu
+                    adj_factors[COLUMNS + 2 * c + 1] = adj_factors[COLUMNS + 2 * c + 1] + wp.dot(f, w)
                 if wp.static(FRAMED):  # adjoint of a rotation of the frame
                     g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
                 if wp.static(PYRAMID):

@@ -24,6 +24,7 @@ class KernelSpec:
     block: int = 1  # environments that one thread steps at once (wide.py)
     implicit: bool
     varied: bool = False  # constants are multiplied by factors of each environment (lane.py)
+    parameters: int = 0  # number of the scene's constants with gradients (parameters.py)
     forced: int  # number of bodies that external forces act on (force.py), 0 without
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, block, component]
     # how threads share an environment (lanes.py); slots: the most links that one of them has
@@ -88,7 +89,7 @@ def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = Fa
     """Make the spec of a scene and a division of its environments; options are the fields that neither decides."""
     limbs = division.threads_per_env > division.sharers  # lanes then have only the trunk's links in common
     return KernelSpec(
-        **{name: getattr(scene, name) for name in ("nlink", "nu", "carrier", "nball", "features")},
+        **{name: getattr(scene, name) for name in ("nlink", "nu", "carrier", "nball", "features", "parameters")},
         **{name: getattr(division, name) for name in ("threads_per_env", "sharers", "trunk", "slots")},
         dtype=dtype,
         forced=scene.nbody if forced else 0,

@@ -132,6 +132,7 @@ class Scene:
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
+    parameters: int = 0  # number of constants whose gradients the backward kernel computes, see extra/parameters.py
 
     @property
     def nlink(self) -> int:

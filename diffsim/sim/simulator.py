@@ -30,16 +30,15 @@ State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 class Simulator:
     """A batch of independent copies of one scene, stepped by control steps of equal length.
 
-    Up to `horizon` differentiable control steps make a window, and `rewind` begins the next one. A backward pass must
-    run before the next window overwrites its steps, otherwise it raises RuntimeError. Steps without gradients store
-    nothing.
+    Up to `horizon` differentiable control steps make a rollout, and `rewind` begins the next one. A backward pass must
+    run before the next rollout overwrites its steps, otherwise it raises RuntimeError.
 
     Args:
         scene: the robot and its ground; a terrain has one profile for all copies, or one for each.
         num_envs: number of copies N.
         integration: contact model and substeps.
         control_dt: seconds of one control step.
-        horizon: largest number of differentiable control steps in a window.
+        horizon: largest number of differentiable control steps in a rollout.
         **options: device, dtype, threads, factors, forces, block, division: see Options.
 
     Raises:
@@ -53,11 +52,9 @@ class Simulator:
         forces: (N, nbody, 6) external force [N] and torque [N m] on each body in world axes at its centre of mass,
             initially zero, constant over a control step: MuJoCo's xfrc_applied, with rows as in scene.mj_model. Used
             like factors. Forces on the world and on bodies fixed to it have no effect. (N, 0, 6) without forces=True.
-        nonfinite: (N,) bool, environments whose last step was not finite, passed 1e5 m, rad, m/s or rad/s, or started
-            from a quaternion shorter than 1e-15 or longer than 1e15. They keep the state from before the step, with
-            zero gradient. Other environments do not change.
-        residual: (N,) on MuJoCo's contact, the acceleration that Newton's method still misses after its last pass,
-            relative to sqrt(1 + |qacc|^2), in the substep of the last step where it is largest. Zeros on soft contact.
+        nonfinite: (N,) bool, environments whose last step failed, see docs/physics.md. They keep the state from before
+            it, with zero gradient. Other environments do not change.
+        residual: (N,) largest residual of Newton's method in the last step, see docs/physics.md. Zeros on soft contact.
         unconverged: (N,) int32, number of control steps so far that ended with a residual above the tolerance.
         nonfinite_gradients: (N,) int32, number of control steps so far whose adjoint was not finite and was set to 0.
     """
@@ -86,7 +83,7 @@ class Simulator:
         self.device = torch.device(self.options.device)
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
         n, how, hard = num_envs, self.integration, self.integration.contact == "mujoco"
-        width, bodies = len(FACTORS) if self.options.factors else 0, scene.nbody if self.options.forces else 0
+        width, bodies = scene.parameters or len(FACTORS) * self.options.factors, scene.nbody * self.options.forces
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
@@ -104,8 +101,8 @@ class Simulator:
         self.nonfinite_gradients, self.unconverged = self._zeros(2, n, dtype=torch.int32)
         self._rows: Any = None  # what backward needs of each substep, of all slots
         self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
-        self._slot, self._last = 0, horizon  # of the window's next differentiable step, of the last step
-        self._versions = [0] * horizon  # each slot serves a new step in each window
+        self._slot, self._last = 0, horizon  # of the rollout's next differentiable step, of the last step
+        self._versions = [0] * horizon  # each slot serves a new step in each rollout
 
     def _zeros(self, *size: int, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.zeros(size, dtype=dtype or self.dtype, device=self.device)
@@ -158,7 +155,7 @@ class Simulator:
         Raises:
             ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors or forces that were changed
                 in place to what is not allowed.
-            RuntimeError: a differentiable step in a full window.
+            RuntimeError: a differentiable step in a full rollout.
         """
         for name, value, width in zip(("qpos", "qvel", "ctrl"), (qpos, qvel, ctrl), self._widths, strict=False):
             self.check_tensor(name, value, width)
@@ -174,7 +171,7 @@ class Simulator:
         if torch.is_grad_enabled() and any(part.requires_grad for part in start):
             if self._slot == self.horizon:
                 raise RuntimeError(
-                    f"horizon of {self.horizon} differentiable steps exceeded: begin a new window by an environment's "
+                    f"horizon of {self.horizon} differentiable steps exceeded: begin a new rollout by an environment's "
                     "detach() or a simulator's rewind(), step under torch.no_grad(), or make it with a larger horizon"
                 )
             slot, self._slot = self._slot, self._slot + 1
@@ -199,8 +196,8 @@ class Simulator:
         """Compute A (N, 2 nv, 2 nv) and B (N, 2 nv, nu) of a step: dx' = A dx + B dctrl, in 2 nv backward passes.
 
         x is qpos, then qvel, and differences of qpos are those of MuJoCo's mjd_transitionFD: a rotation changes by a
-        rotation vector in the body's frame. Arguments, factors and forces are as for `step`. It takes the place of the
-        window's next step for as long as it needs it. Rows of `nonfinite` environments are zero.
+        rotation vector in the body's frame. Arguments are as for `step`. The rollout must have room for a step. Rows of
+        `nonfinite` environments are zero.
         """
         leaves, slot = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._slot
         with torch.enable_grad():
@@ -212,7 +209,7 @@ class Simulator:
         return torch.cat((g_qpos, g_qvel), dim=2) @ self.tangent.basis(torch.cat(leaves[:2], dim=1).detach()), B
 
     def rewind(self) -> None:
-        """Begin a new window of differentiable steps."""
+        """Begin a new rollout of differentiable steps."""
         self._slot = 0
 
     def _command(self, kernel: str, slot: int) -> list[wp.Launch]:

@@ -222,7 +222,7 @@ class Task:
         """Return the memory (..., num_memory) after a control step.
 
         Args:
-            memory: (..., num_memory) before it; gradients flow through it within a window.
+            memory: (..., num_memory) before it; gradients flow through it within a rollout.
             action: (..., nu) of the step, clipped to [-1, 1].
             noise: (..., num_noise) uniform in [0, 1).
         """

@@ -72,20 +72,20 @@ def lock(directory: Path) -> TextIO:
 
 
 class EpisodeStatistics:
-    """Mean return and length of the last finished episodes: of the newest windows that hold a hundred of them."""
+    """Mean return and length of the last finished episodes: of the newest rollouts that hold a hundred of them."""
 
     def __init__(self) -> None:
-        self.windows: deque[tuple[float, float, float]] = deque()  # episodes finished, sums of return and of length
+        self.rollouts: deque[tuple[float, float, float]] = deque()  # episodes finished, sums of return and of length
 
     def add(self, count: float, total_return: float, total_length: float) -> None:
         if count > 0:
-            self.windows.append((count, total_return, total_length))
-        while len(self.windows) > 1 and sum(window[0] for window in self.windows) - self.windows[0][0] >= 100:
-            self.windows.popleft()
+            self.rollouts.append((count, total_return, total_length))
+        while len(self.rollouts) > 1 and sum(rollout[0] for rollout in self.rollouts) - self.rollouts[0][0] >= 100:
+            self.rollouts.popleft()
 
     def means(self) -> tuple[float, float]:
         """Once an episode has ended."""
-        count, total_return, total_length = (sum(column) for column in zip(*self.windows, strict=True))
+        count, total_return, total_length = (sum(column) for column in zip(*self.rollouts, strict=True))
         return total_return / count, total_length / count
 
 

@@ -41,7 +41,7 @@ def capture(
 
     The first calls run eagerly and count as calls like any other; the next one captures. The function must keep its
     state in tensors that it changes in place, must not wait for the device, and may step `env` from the start of a
-    window to its end: the environment's state and random start states are carried from call to call. What it returns
+    rollout to its end: the environment's state and random start states are carried from call to call. What it returns
     lives in the same memory every time, so copy what is to outlast the next call.
 
     If its tensors are on the CPU, the function comes back as it is.
@@ -66,7 +66,7 @@ def capture(
             return result
         if calls == WARMUP + 1:
             torch.cuda.synchronize(device)
-            start = env.pin_window() if env is not None else None
+            start = env.pin_rollout() if env is not None else None
             with torch.cuda.graph(graph, stream=stream):
                 result = function()
                 if env is not None and start is not None:

@@ -172,7 +172,7 @@ class Run:
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]
             self._totals |= state["totals"]
-            self._episodes.windows.extend(state["episodes"])
+            self._episodes.rollouts.extend(state["episodes"])
         return learner
 
     def capture(self, function: Iterate, env: DiffEnv | None = None, eager: bool = False) -> Iterate:
@@ -229,7 +229,7 @@ class Run:
 
         Args:
             metrics: by their names in tensorboard: () tensors, averaged over the ranks, and numbers.
-            control_steps: how many this iteration took, of all ranks; by default a window of all environments.
+            control_steps: how many this iteration took, of all ranks; by default a rollout of all environments.
         """
         self._open()
         tensors = {name: value.detach() for name, value in metrics.items() if isinstance(value, Tensor)}
@@ -292,7 +292,7 @@ class Run:
             for name in (*TOTALS, *({"unconverged"} & scalars.keys())):
                 self._totals[f"sim/{name}"] = self._totals.get(f"sim/{name}", 0) + round(ranks * scalars.pop(name))
             scalars |= self._totals
-            if self._episodes.windows:
+            if self._episodes.rollouts:
                 scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
         scalars["charts/SPS"] = record.steps / times["time/total"]
         self._scalars = scalars
@@ -386,7 +386,7 @@ class Run:
         args = {k: None if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.args).items()}
         args["device"] = self.args.device if len(ranks) == 1 else self.device.type
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
-        state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
+        state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.rollouts), ranks=ranks)
         state |= dict(simulator=self.simulator, task=find_task(self.args.env).stored())
         state |= dict(robot=pkgutil.resolve_name(checkpoint.PROVENANCE).fingerprint((self._env or self.eval_env).scene))
         with self._writing():

@@ -83,7 +83,7 @@ def test_the_gradient_of_a_window_agrees_with_differences() -> None:
     slopes = gradients.differences(env, policy, noise, along, 1e-5)
     assert torch.equal(env.qpos, start)
     shift = torch.zeros(16, env.scene.nu, dtype=torch.float64, requires_grad=True)
-    (each,) = torch.autograd.grad(gradients.window(env, policy, 4, shift, noise).sum(), shift)
+    (each,) = torch.autograd.grad(gradients.rollout(env, policy, 4, shift, noise).sum(), shift)
     torch.testing.assert_close(each @ along.T, slopes, rtol=1e-4, atol=1e-6)
 
 

@@ -76,14 +76,14 @@ def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> No
     assert paper.table(paper.Args(), "headline") == []
 
 
-def test_a_line_has_the_total_of_seed_1_of_its_or_another_gpu(known: list[dict[str, str]], tmp_path: Path) -> None:
+def test_a_line_has_the_total_of_seed_1_of_its_machine(known: list[dict[str, str]], tmp_path: Path) -> None:
     args, total = paper.Args(output=tmp_path / "cpu"), known[0] | {"in all (s)": "77.6"}
     for machine, other, shown in (
-        ("h100", {}, "63 (78 h100)"),
-        ("h100", {"seed": "2"}, "63"),
-        ("h100", {"revision": "bbbbbbb"}, "63"),
-        ("h100", {"task": "ant"}, "63"),
+        ("h100", {}, "63"),
         ("cpu", {}, "63"),
+        ("h200", {"seed": "2"}, "63"),
+        ("h200", {"revision": "bbbbbbb"}, "63"),
+        ("h200", {"task": "ant"}, "63"),
         ("h200", {}, "63 (78)"),
     ):
         path = tmp_path / machine / "cells.csv"
@@ -117,11 +117,14 @@ def test_pages_show_the_lines_of_the_cells() -> None:
         pytest.skip("the history is not here")
     args, shown = paper.Args(output=common.RESULTS / "cpu"), 0
     for name, group in paper.GROUPS.items():
-        text = (common.DOCS / group.page).read_text()
-        for part in re.findall(rf"<!-- {name} -->\n(.*?)<!-- /{name} -->", text, re.DOTALL):
-            if "|" in (expected := paper.printed(args, name)) or not group.older:
-                assert part == expected
-            shown += len(paper.table(args, name))
+        if not group.page:
+            continue
+        (part,) = re.findall(
+            rf"<!-- {name} -->\n(.*?)<!-- /{name} -->", (common.DOCS / group.page).read_text(), re.DOTALL
+        )
+        if "|" in (expected := paper.printed(args, name)) or not group.older:
+            assert part == expected
+        shown += len(paper.table(args, name))
     assert shown
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import robustness
@@ -19,9 +21,10 @@ from diffsim import DiffEnv, Integration
 from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.task import HumanoidImitation
 from diffsim.tasks import Task
-from diffsim.training import SavedPolicy
+from diffsim.training import SavedPolicy, checkpoint
 from diffsim.training.checkpoint import POLICIES
 from diffsim.training.evaluation import SEED
+from diffsim.training.layers import Chain
 
 PUCK = """
 <mujoco>
@@ -108,6 +111,20 @@ def test_the_command_writes_a_row(tmp_path: Path) -> None:
     (row,) = read_csv(tmp_path / "robustness.csv")
     assert row["robots"] == "7" and row["unpushed"] == "0"
     assert "sideways N" not in row and 10 < float(row["forward N"]) < 500
+
+
+def test_a_policy_of_a_file_s_task_is_measured_if_the_file_is_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, path = "examples/servo_tasks.py:Dog", tmp_path / "dog.pt"
+    env = diffsim.make(own, 1)
+    network = Chain(torch.nn.Linear(env.task.obs_dim, env.scene.nu))
+    learner = SimpleNamespace(policy=network)
+    checkpoint.save(path, "pfpn", learner, {"args": {"env": own, "seed": 1, "contact": "mujoco"}, "iteration": 1})
+    args = parse(robustness.Args, None, [str(path), "--num-envs", "2"])
+    assert "give its file" in refusal(lambda: robustness.load(args, path), capsys)
+    case = robustness.load(replace(args, own=own), path)
+    assert case.about["task"] == "dog" and case.about["learner"] == "pfpn"
 
 
 def test_a_motion_that_ends_is_refused(

@@ -76,10 +76,10 @@ def test_a_crash_while_columns_join_leaves_the_old_file(tmp_path: Path, monkeypa
     assert path.read_text() == before
 
 
-def test_episode_statistics_are_of_the_newest_windows_with_a_hundred_episodes() -> None:
+def test_episode_statistics_are_of_the_newest_rollouts_with_a_hundred_episodes() -> None:
     statistics = EpisodeStatistics()
     statistics.add(0, 0.0, 0.0)
-    assert not statistics.windows
+    assert not statistics.rollouts
     statistics.add(60, 600.0, 6000.0)
     assert statistics.means() == (10.0, 100.0)
     statistics.add(30, 600.0, 3000.0)

@@ -22,7 +22,7 @@ import sac_baseline
 import shac
 from diffsim.env import DiffEnv
 
-# Three windows of cartpole: the last one holds time-outs and resets.
+# Three rollouts of cartpole: the last one holds time-outs and resets.
 SETTING = (
     "--env cartpole --num-envs 4 --horizon 84 --iterations 3 --eval-every 0 --eval-episodes 1 --quiet --threads 1 "
     "--device cpu"

@@ -65,7 +65,7 @@ def test_evaluations_are_alike_whatever_was_before() -> None:
     env, policy = diffsim.make("ant", num_envs=4, seed=0), torch.nn.Linear(37, 8)
     player, expected = evaluation.Player(env, policy), evaluate(diffsim.make("ant", num_envs=4), policy)
     player.evaluate(seed=5)
-    pinned = env.pin_window()
+    pinned = env.pin_rollout()
     again = player.evaluate()
     assert torch.equal(again.returns, expected.returns) and torch.equal(again.qpos, expected.qpos)
     env.reset(seed=evaluation.SEED)

@@ -235,7 +235,7 @@ def test_defaults_are_the_tables(script):
             expected |= {name: min(expected.get(name, most), most) for name, most in script.CPU.items()}
             expected |= getattr(script, "ON_CPU", {}).get(env, {})
         preset = getattr(script, "INTEGRATION", {}).get(env) or diffsim.TASKS[env].integration("default")
-        if preset.contact == "mujoco" and script.__name__ in ("shac", "sapo"):  # shorter windows of more
+        if preset.contact == "mujoco" and script.__name__ in ("shac", "sapo"):  # shorter rollouts of more
             expected |= {"num_envs": 4 * expected.get("num_envs", script.Args().num_envs)}
             assert args.horizon == (16 if env in ("g1", "g1_track") and script.__name__ in ("shac", "sapo") else 8)
         expected |= dict(contact=preset.contact, substeps=preset.substeps, implicit=preset.implicit)

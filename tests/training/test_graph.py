@@ -10,14 +10,14 @@ from diffsim.training import graph
 from diffsim.training.evaluation import Player
 
 
-def windows(name: str, captured: bool, poison: int | None = None, adjoint_clip: float = 0.0) -> list[torch.Tensor]:
-    """Rewards, their gradient and the state of six windows; one environment is thrown out of the finite numbers."""
+def rollouts(name: str, captured: bool, poison: int | None = None, adjoint_clip: float = 0.0) -> list[torch.Tensor]:
+    """Rewards, their gradient and the state of six rollouts; one environment is thrown out of the finite numbers."""
     torch.manual_seed(0)
     env = diffsim.make(name, num_envs=16, seed=0, horizon=8, device="cuda", adjoint_clip=adjoint_clip)
     action = torch.zeros(8, 16, env.scene.nu, device="cuda", requires_grad=True)
     velocity = torch.zeros_like(env.qvel)
 
-    def window() -> tuple[torch.Tensor, ...]:
+    def rollout() -> tuple[torch.Tensor, ...]:
         env.detach()
         env.qvel = env.qvel + velocity
         noise = torch.rand_like(action) * 2 - 1
@@ -26,7 +26,7 @@ def windows(name: str, captured: bool, poison: int | None = None, adjoint_clip: 
         (gradient,) = torch.autograd.grad(rewards.sum(), action)
         return rewards.detach(), gradient, env.qpos.detach(), ended
 
-    call = graph.capture(window, "cuda", env) if captured else window
+    call = graph.capture(rollout, "cuda", env) if captured else rollout
     history = []
     for k in range(6):
         velocity.zero_()
@@ -40,7 +40,7 @@ def windows(name: str, captured: bool, poison: int | None = None, adjoint_clip: 
 @pytest.mark.parametrize("name, adjoint_clip", [("cartpole", 0.0), ("ant", 0.0), ("ant", 1.0)])
 def test_graph_and_eager_agree(name: str, adjoint_clip: float) -> None:
     """Bitwise, noise and random start states included: each replay draws the numbers that an eager call would."""
-    captured, eager = (windows(name, way, adjoint_clip=adjoint_clip) for way in (True, False))
+    captured, eager = (rollouts(name, way, adjoint_clip=adjoint_clip) for way in (True, False))
     assert all(torch.equal(a, b) for a, b in zip(captured, eager, strict=True))
     rewards = captured[0]
     assert not torch.equal(rewards[4], rewards[5])
@@ -72,7 +72,7 @@ def test_evaluations_by_a_graph_are_those_of_eager_steps(name: str) -> None:
 @pytest.mark.gpu
 def test_a_graph_contains_what_is_not_finite() -> None:
     bad, good = 3, [k for k in range(16) if k != 3]
-    clean, poisoned = windows("ant", True), windows("ant", True, poison=bad)
+    clean, poisoned = rollouts("ant", True), rollouts("ant", True, poison=bad)
     assert poisoned[3][4, 0, bad] and poisoned[3].sum() == 1 and not clean[3].any()
     for ours, expected in zip(poisoned[:2], clean[:2], strict=True):
         assert torch.equal(ours[:, :, good], expected[:, :, good]) and ours.isfinite().all()

@@ -52,19 +52,19 @@ MEAN, STD = (0, 5, -100, 1e-3), (1, 10, 0.1, 1e-3)
 
 
 @pytest.fixture
-def windows(rng: np.random.Generator) -> list[np.ndarray]:
+def rollouts(rng: np.random.Generator) -> list[np.ndarray]:
     return [rng.normal(MEAN, STD, size=(8, 6, 4)) for _ in range(20)]
 
 
 @pytest.mark.parametrize("size", [None, 4])
-def test_statistics_are_those_of_all_data(windows: list[np.ndarray], size: int | None) -> None:
+def test_statistics_are_those_of_all_data(rollouts: list[np.ndarray], size: int | None) -> None:
     """Of scalars, or of each column."""
     normalizer = ObsNormalizer(size)
     probe = torch.randn(5, 4) if size else torch.randn(3, 2)
     torch.testing.assert_close(normalizer(probe), probe)  # nothing seen yet
-    for window in windows:
-        normalizer.update(torch.tensor(window if size else window[..., 1], dtype=torch.float32))
-    data = np.concatenate(windows).reshape(-1, 4) if size else np.concatenate(windows)[..., 1].reshape(-1)
+    for rollout in rollouts:
+        normalizer.update(torch.tensor(rollout if size else rollout[..., 1], dtype=torch.float32))
+    data = np.concatenate(rollouts).reshape(-1, 4) if size else np.concatenate(rollouts)[..., 1].reshape(-1)
     assert normalizer.count == len(data)
     np.testing.assert_allclose(normalizer.mean, data.mean(0), rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(normalizer.var, data.var(0), rtol=1e-3)

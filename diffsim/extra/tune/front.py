@@ -104,7 +104,7 @@ def measure(motion: Motion, found: list[Integration], rows: list[Row], **options
 
 def timed(sims: Sequence[Simulator], motion: Motion) -> list[list[float]]:
     """Microseconds of a control step of one environment, forward and with its gradient: the least of ROUNDS turns of
-    all simulators, in windows of 8 steps from the start states."""
+    all simulators, in rollouts of 8 steps from the start states."""
     best = np.full((len(sims), 2), np.inf)
     for turn in range(ROUNDS + 1):  # the first one compiles and warms up
         order = [*zip(best, sims, strict=True)]

@@ -1,0 +1,120 @@
+"""Gradients by a scene's constants: of links, joints, motors and contacts, as extra/parameters.py asks for.
+
+In phi (backward.py) a link has W . (I a + v x* I v), and W1 . I D where damping follows the constraints. These are
+linear in the link's mass, first moments and moments of inertia about its origin. With x and y the twists about it,
+
+    x . I y = m x_l . y_l + h . (y_l x x_a + x_l x y_a) + x_a . I y_a,
+
+and W . v x* I v = (W x v) . I v. A joint has lambda (armature a - force), a contact -f . w. Forces of constraints are
+proportional to D, and so to the inverse of the inverse weight, of which the columns hold the logarithm.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.constraint import constraint_law
+from diffsim.kernels.joint import joint_law
+from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.model import functions, types
+from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
+
+# Columns: of each link mass, first moments (3) and moments of inertia xx, yy, zz, xy, xz, yz; of each joint, in its
+# link's row, those named below; of each motor gear and bias; of each contact friction and the logarithm of its weight.
+LINK, JOINT, MOTOR, CONTACT = 10, 6, 2, 2
+ARMATURE, DAMPING, LOSS, WEIGHT, STIFFNESS, SERVO_DAMPING = range(JOINT)
+
+
+@cache
+def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
+    t, sp, kin, joint, block = types(spec), spatial(spec), kinematics(spec), joint_law(spec), blocks(spec)
+    T, vec3, vec6, mat3, Model, Lane, Ck, Array = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Lane, t.Checkpoint, t.Ts
+    Link, Node, pick, load = t.Link, t.Node, block.pick, kin.load
+    constraint = constraint_law(spec) if spec.constrained else None
+    LIMIT, FRICTIONLOSS, CLAMP, MOTORS, EXPLICIT_SERVOS = spec.has("limit frictionloss clamp motor explicit_servos")
+    LIMIT, CONSTRAINED, DAMPED, IMPLICIT = LIMIT and spec.constrained, spec.constrained, spec.damped, spec.implicit
+    FIRST, VADR, NV, NU = 0 if spec.floating else 1, spec.dof0 - 1, spec.nv, spec.nu
+    JOINTS = LINK * spec.nlink
+    MOTOR0 = JOINTS + JOINT * spec.nlink
+
+    @wp.func
+    def add(columns: Array, k: int, value: T):
+        columns[k] = columns[k] + value
+
+    @wp.func
+    def add_product(columns: Array, k: int, link: Link, x: vec6, y: vec6):
+        """Add the derivatives of x . I y; x and y are about the carrier."""
+        R = wp.transpose(link.R)
+        xa = R * wp.spatial_top(x)
+        ya = R * wp.spatial_top(y)
+        xl = R * sp.point_velocity(x, link.x)
+        yl = R * sp.point_velocity(y, link.x)
+        first = wp.cross(yl, xa) + wp.cross(xl, ya)
+        add(columns, k, wp.dot(xl, yl))
+        for r in range(3):
+            add(columns, k + 1 + r, first[r])
+            add(columns, k + 4 + r, xa[r] * ya[r])
+        add(columns, k + 7, xa[0] * ya[1] + xa[1] * ya[0])
+        add(columns, k + 8, xa[0] * ya[2] + xa[2] * ya[0])
+        add(columns, k + 9, xa[1] * ya[2] + xa[2] * ya[1])
+
+    @wp.func
+    def add_joint(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, parent: Node, columns: Array):
+        """Add the derivatives of joint i's part of phi."""
+        k = JOINTS + JOINT * i
+        lam = own.lam
+        qdd = load(ck.a, here.row, int(CONSTRAINED) * NV + VADR + i, here.e)
+        unclamped = T(1.0)
+        if wp.static(CLAMP):
+            unclamped = own.unclamped
+        force = lam * link.qd  # of a damper of 1, with the sign of phi
+        if wp.static(IMPLICIT):
+            force = force + here.h * lam * qdd
+        inertial = lam * qdd
+        servo = unclamped * force
+        if wp.static(DAMPED):  # the second solve: (M + h b) change + h b qacc = 0
+            lam1 = wp.dot(link.S, own.W1 - parent.W1) / wp.dot(link.S, link.S)
+            end = load(ck.a, here.row, VADR + i, here.e)
+            inertial = inertial + lam1 * (end - qdd)
+            force = force + here.h * lam1 * end
+            if wp.static(not EXPLICIT_SERVOS):
+                servo = unclamped * force
+        add(columns, k + ARMATURE, inertial)
+        add(columns, k + DAMPING, force)
+        add(columns, k + STIFFNESS, unclamped * lam * link.q)
+        add(columns, k + SERVO_DAMPING, servo)
+        if wp.static(LIMIT):
+            limit = constraint.limit_state(m, here, i, link.q, link.qd)
+            jar = limit[2] * qdd + limit[1]
+            add(columns, k + WEIGHT, -lam * limit[2] * pick(jar, T(0.0), limit[0], T(0.0)) * jar)
+        if wp.static(FRICTIONLOSS):
+            loss = m.joint_loss[i]
+            f = -T(loss[1]) * (qdd + T(loss[2]) * link.qd)
+            slides = pick(T(loss[0]), wp.abs(f), T(1.0), T(0.0))
+            add(columns, k + LOSS, -lam * slides * pick(f, T(0.0), T(-1.0), T(1.0)))
+            add(columns, k + WEIGHT, lam * (T(1.0) - slides) * f)
+
+    @wp.func
+    def add_parameters(m: Model, here: Lane, ck: Ck, links: t.Links, nodes: t.Nodes, ctrl: t.array2, columns: Array):
+        """Add the derivatives of phi, without those of contacts: constraint.add_contacts_adjoint has these."""
+        for i in range(FIRST, here.n):
+            add_product(columns, LINK * i, links[i], nodes[i].W, nodes[i].A)
+            add_product(columns, LINK * i, links[i], wp.spatial_cross(nodes[i].W, links[i].V), links[i].V)
+            if wp.static(DAMPED):
+                add_product(columns, LINK * i, links[i], nodes[i].W1, nodes[i].D)
+        for i in range(1, here.n):
+            add_joint(m, here, i, ck, links[i], nodes[i], nodes[m.parent[i]], columns)
+        if wp.static(MOTORS):
+            for k in range(NU):
+                i = m.motor_slot[k]
+                push = -nodes[i].lam
+                if wp.static(CLAMP):
+                    push = nodes[i].unclamped * push
+                if i > 0:
+                    add(columns, MOTOR0 + MOTOR * k, push * block.read(ctrl, here.e, k))
+                    add(columns, MOTOR0 + MOTOR * k + 1, push)
+
+    return functions(locals())
