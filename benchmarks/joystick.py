@@ -140,9 +140,14 @@ def worlds(row: dict[str, str]) -> list[str]:
     return found or [f"friction x {float(row['friction']):g}"]
 
 
+def alone(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    return [row for row in rows if "_shared/" not in row["checkpoint"]]
+
+
 def policies(rows: list[dict[str, str]]) -> dict[str, list[dict[str, str]]]:
     """The rows of each task, learner and machine, by these; of other files than the task's, if there are any."""
-    rows = [row | {"by": row["learner"].partition(" ")[0], "on": row["checkpoint"].partition("/")[0]} for row in rows]
+    rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
+    rows = [row | {"on": row["checkpoint"].partition("/")[0].removesuffix("_shared")} for row in rows]
     rows.sort(key=lambda row: (row["task"], row["by"], row["on"]))
     rows = [row for row in rows if row["file"]] or rows
     return {", ".join(key): group for key, group in grouped(rows, "task", "by", "on").items()}
@@ -164,7 +169,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     for policy, group in policies(rows).items():
         plain = undisturbed(group)
         line = {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
-        line |= {"training (s)": middle(plain, "training s", ".0f")}
+        line |= {"training (s)": middle(alone(plain), "training s", ".0f")}
         errors = {"error (m/s)": "error", "worst command (m/s)": "worst error", "yaw rate (rad/s)": "yaw error"}
         lines.append(line | {title: with_worst(plain, column, ".3f", max) for title, column in errors.items()})
     return lines

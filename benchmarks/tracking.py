@@ -26,7 +26,7 @@ import common
 import numpy as np
 import torch
 from common import ABOUT, Part, load_case, measured, run
-from joystick import training
+from joystick import alone, training
 from tables import Row, grouped, markdown, middle, numbers
 from worlds import Array, OtherFile, State, pushes, rollout
 
@@ -100,10 +100,6 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 def least(rows: list[dict[str, str]]) -> str:
     return f"{min(found):.0%}" if (found := numbers(rows, "success")) else ""
-
-
-def alone(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    return [row for row in rows if "_shared/" not in row["checkpoint"]]
 
 
 def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str]], list[dict[str, str]]]]:
