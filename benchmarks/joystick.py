@@ -176,7 +176,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def whole(rows: list[dict[str, str]]) -> list[Row]:
-    """The share of episodes without a fall: a column for each task, learner and machine, a line for worlds that agree
+    """The share of episodes without a fall: a line for each task, learner and machine, a column for worlds that agree
     in all of them."""
     lines: dict[str, dict[str, str]] = {}
     for policy, group in policies(rows).items():
@@ -190,7 +190,8 @@ def whole(rows: list[dict[str, str]]) -> list[Row]:
     for kind in sorted(lines, key=lambda kind: [not kind.startswith(name) for name in order]):
         agreeing.setdefault(tuple(lines[kind].get(policy, "") for policy in policies(rows)), []).append(kind)
     return [
-        {"world": ", ".join(kinds)} | dict(zip(policies(rows), cells, strict=True)) for cells, kinds in agreeing.items()
+        {"policy": policy} | {", ".join(kinds): cells[k] for cells, kinds in agreeing.items()}
+        for k, policy in enumerate(policies(rows))
     ]
 
 
