@@ -288,6 +288,25 @@ def test_contact_in_single_precision_is_near(rng):
     check_neighbours(scene, [x[:8] for x in states])
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", ["tied", "tangled"])
+def test_rows_on_a_gpu_are_the_cpus(kind, rng):
+    scene = tied_tree("floating", 0)
+    states, found = tied_states(scene, 40, rng), []
+    if kind == "tangled":
+        scene, states = tangled("floating", "elliptic", 0, 40, rng)
+    for device in ("cpu", "cuda"):
+        integration = Integration("mujoco", 2, tolerance=1e-11)
+        sim = Simulator(scene, 40, integration, 2 * H, dtype=torch.float64, device=device)
+        leaves = [torch.tensor(x, device=device, requires_grad=True) for x in states]
+        ends = sim.step(*leaves)
+        grads = torch.autograd.grad(ends[1].sin().sum(), leaves, allow_unused=True)
+        found.append([x.detach().cpu() for x in (*ends, *grads) if x is not None and x.numel()])
+    for value, expected in zip(*found, strict=True):
+        scale = expected.abs().amax(1, keepdim=True).clamp(min=1.0)
+        torch.testing.assert_close(value / scale, expected / scale, rtol=0.0, atol=1e-7)
+
+
 def test_what_rows_between_bodies_do_not_have_is_named():
     scene = parse(pendulum(rest='<equality><joint name="lock" joint1="hinge"/></equality>'))
     with pytest.raises(SceneError, match=r"soft contact has no equality constraints \('lock'\); choose MuJoCo's"):
