@@ -7,6 +7,7 @@ python examples/own_quadruped.py a1.onnx
 """
 
 import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -63,4 +64,6 @@ def play(path: str, seconds: float = 10.0) -> float:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_file():
+        sys.exit("usage: python examples/own_quadruped.py a1.onnx, a file that diffsim export has written")
     print(f"{play(sys.argv[1]):.2f} m in 10 s")
