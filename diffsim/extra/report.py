@@ -20,7 +20,7 @@ from diffsim.robot.contact import (
     pair_law,
 )
 from diffsim.robot.elements import control_range, label, listed, motors
-from diffsim.robot.pairs import as_capsules, self_pairs
+from diffsim.robot.pairs import as_capsules, is_exact, self_pairs
 from diffsim.robot.scene import Scene
 
 Kind, Geom, Integrator = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtIntegrator
@@ -81,12 +81,12 @@ def _bodies(scene: Scene) -> Iterator[str]:
 
 
 def _self_contact(scene: Scene) -> Iterator[str]:
-    m, touching = scene.mj_model, set(scene.geom_pairs)
-    fitted = as_capsules(m)
-    if rough := [g for g in {*sum(touching, ())} if m.geom_type[g] != fitted.geom_type[g]]:
+    m, fitted = scene.mj_model, as_capsules(scene.mj_model)
+    inexact = {geom for pair in scene.geom_pairs for geom in pair if not is_exact(m, *pair)}
+    if rough := [geom for geom in inexact if m.geom_type[geom] != fitted.geom_type[geom]]:
         worst = max(float(abs(_reach(m, geom) - _reach(fitted, geom)).max()) for geom in rough)
         yield f"Shapes that touch others as capsules: {len(rough)} (surfaces differ by up to {1e3 * worst:.3g} mm)."
-    if not (pairs := [pair for pair in self_pairs(m) if pair not in touching]):
+    if not (pairs := [pair for pair in self_pairs(m) if pair not in scene.geom_pairs]):
         return
     names = " and ".join(label(m, Kind.mjOBJ_GEOM, geom) for geom in pairs[0])
     count = f"{len(pairs)} pairs of geoms, such as" if len(pairs) > 1 else "the geoms"
@@ -110,9 +110,8 @@ def _ground(scene: Scene) -> Iterator[str]:
 
 def _depth(m: mujoco.MjModel, geom: int) -> float:
     """Return how far [m] a shape reaches beyond its contact points, in the direction where that is farthest."""
-    turned = _directions() @ _axes(m, geom)
-    points = (turned @ contact_points(m, geom)[0].T).max(1) + _directions() @ m.geom_pos[geom]
-    return float((_reach(m, geom) - points).max())
+    points = m.geom_pos[geom] + contact_points(m, geom)[0] @ _axes(m, geom).T
+    return float((_reach(m, geom) - (_directions() @ points.T).max(1)).max())
 
 
 def _directions() -> NDArray[np.float64]:
