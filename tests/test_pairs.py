@@ -326,9 +326,7 @@ def test_what_rows_between_bodies_do_not_have_is_named():
         Simulator(scene, 1, Integration())
     with pytest.raises(ValueError, match="threads_per_env is 2, must be 1 with rows between two bodies"):
         Simulator(scene, 1, Integration("mujoco", 4), division=(2, 1))
-    with pytest.raises(
-        SceneError, match="soft contact has no contact between a robot's parts; choose MuJoCo's contact"
-    ):
+    with pytest.raises(SceneError, match="soft contact has no contact between bodies; choose MuJoCo's contact"):
         Simulator(with_pairs(tangle("fixed", "elliptic", 0)), 1, Integration())
     far = parse(pendulum(rest='<equality><joint name="lock" joint1="hinge" solref="1e-30 1e-30"/></equality>'))
     far.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)

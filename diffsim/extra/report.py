@@ -19,7 +19,7 @@ from diffsim.robot.contact import (
     hull,
     pair_law,
 )
-from diffsim.robot.elements import control_range, label, listed, motors
+from diffsim.robot.elements import at_rest, control_range, label, listed, motors
 from diffsim.robot.pairs import as_capsules, is_exact, self_pairs
 from diffsim.robot.scene import Scene
 
@@ -110,7 +110,8 @@ def _ground(scene: Scene) -> Iterator[str]:
 
 def _depth(m: mujoco.MjModel, geom: int) -> float:
     """Return how far [m] a shape reaches beyond its contact points, in the direction where that is farthest."""
-    points = m.geom_pos[geom] + contact_points(m, geom)[0] @ _axes(m, geom).T
+    data = at_rest(m)
+    points = data.geom_xpos[geom] + contact_points(m, geom)[0] @ data.geom_xmat[geom].reshape(3, 3).T
     return float((_reach(m, geom) - (_directions() @ points.T).max(1)).max())
 
 
@@ -120,15 +121,10 @@ def _directions() -> NDArray[np.float64]:
     return np.stack((level * np.cos(turn), level * np.sin(turn), z), 1)
 
 
-def _axes(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, m.geom_quat[geom])
-    return axes.reshape(3, 3)
-
-
 def _reach(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
-    """Return how far [m] a shape reaches from its body's origin in each direction."""
-    directions, (a, b, c), kind = _directions() @ _axes(m, geom), m.geom_size[geom], m.geom_type[geom]
+    """Return how far [m] a shape reaches from the world's origin in each direction, in the reference pose."""
+    data, (a, b, c), kind = at_rest(m), m.geom_size[geom], m.geom_type[geom]
+    directions = _directions() @ data.geom_xmat[geom].reshape(3, 3)
     x, y, z = abs(directions.T)
     reach = {
         int(Geom.mjGEOM_SPHERE): a + 0 * z,
@@ -138,7 +134,7 @@ def _reach(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
         int(Geom.mjGEOM_ELLIPSOID): np.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2),
     }
     corners = hull(m, m.geom_dataid[geom]) if kind == Geom.mjGEOM_MESH else np.zeros((1, 3))
-    return reach.get(int(kind), (directions @ corners.T).max(1)) + _directions() @ m.geom_pos[geom]
+    return reach.get(int(kind), (directions @ corners.T).max(1)) + _directions() @ data.geom_xpos[geom]
 
 
 def _options(scene: Scene) -> Iterator[str]:
