@@ -244,6 +244,38 @@ def test_gradient_through_contact_is_that_of_differences(base, cone, rng):
         check_gradients(scene, [x[calm] for x in states], rng)
 
 
+def marbles(cone, seed):
+    """A box and two spheres, all free, which touch the box only."""
+    rng, bodies = np.random.default_rng(seed), ""
+    for kind, masks in (("box", (2, 0)), ("sphere", (0, 2)), ("sphere", (0, 2))):
+        size, place, turn = (
+            " ".join(map(str, x)) for x in rng.uniform((0.04, -0.05, -180), (0.12, 0.05, 180), (3, 3)).T
+        )
+        geom = f'type="{kind}" size="{size}" pos="{place}" euler="{turn}" contype="{masks[0]}" conaffinity="{masks[1]}"'
+        bodies += f"<body> <freejoint/> <geom {geom}/> </body>"
+    return parse(f'<mujoco><option cone="{cone}"/><worldbody> {bodies} </worldbody></mujoco>')
+
+
+@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
+def test_spheres_touch_boxes_as_in_mujoco(cone, rng):
+    """At faces, edges and corners, and with their centres inside; gradients are those of differences."""
+    depths = []
+    for seed in range(10):
+        scene, n = marbles(cone, seed), 32
+        qpos, qvel, ctrl = free_states(scene, n, rng)
+        qpos.reshape(n, 3, 7)[..., :3] = 0.1 * rng.normal(size=(n, 3, 3))
+        states, model = (qpos, 0.3 * qvel, ctrl), model_as_it_is(scene)
+        expected, found = in_mujoco(scene, *states, model=model)[1], step(scene, states)[1]
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+        data = mujoco.MjData(model)
+        for each in qpos:
+            data.qpos = each
+            mujoco.mj_fwdPosition(model, data)
+            depths += [-contact.dist / model.geom_size[max(contact.geom), 0] for contact in data.contact]
+    assert min(depths) < 0.2 and max(depths) > 1.2  # in radii
+    check_gradients(scene, [x[:8] for x in states], rng)
+
+
 def test_other_shapes_touch_as_their_capsules(rng):
     """Which MuJoCo has in their place here."""
     arms = ""
@@ -313,9 +345,7 @@ def test_what_rows_between_bodies_do_not_have_is_named():
         Simulator(scene, 1, Integration())
     with pytest.raises(ValueError, match="threads_per_env is 2, must be 1 with rows between two bodies"):
         Simulator(scene, 1, Integration("mujoco", 4), division=(2, 1))
-    with pytest.raises(
-        SceneError, match="soft contact has no contact between a robot's parts; choose MuJoCo's contact"
-    ):
+    with pytest.raises(SceneError, match="soft contact has no contact between bodies; choose MuJoCo's contact"):
         Simulator(with_pairs(tangle("fixed", "elliptic", 0)), 1, Integration())
     far = parse(pendulum(rest='<equality><joint name="lock" joint1="hinge" solref="1e-30 1e-30"/></equality>'))
     far.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)

@@ -19,8 +19,8 @@ from diffsim.robot.contact import (
     hull,
     pair_law,
 )
-from diffsim.robot.elements import control_range, label, listed, motors
-from diffsim.robot.pairs import as_capsules, self_pairs
+from diffsim.robot.elements import at_rest, control_range, label, listed, motors
+from diffsim.robot.pairs import as_capsules, is_exact, self_pairs
 from diffsim.robot.scene import Scene
 
 Kind, Geom, Integrator = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtIntegrator
@@ -81,12 +81,12 @@ def _bodies(scene: Scene) -> Iterator[str]:
 
 
 def _self_contact(scene: Scene) -> Iterator[str]:
-    m, touching = scene.mj_model, set(scene.geom_pairs)
-    fitted = as_capsules(m)
-    if rough := [g for g in {*sum(touching, ())} if m.geom_type[g] != fitted.geom_type[g]]:
+    m, fitted = scene.mj_model, as_capsules(scene.mj_model)
+    inexact = {geom for pair in scene.geom_pairs for geom in pair if not is_exact(m, *pair)}
+    if rough := [geom for geom in inexact if m.geom_type[geom] != fitted.geom_type[geom]]:
         worst = max(float(abs(_reach(m, geom) - _reach(fitted, geom)).max()) for geom in rough)
         yield f"Shapes that touch others as capsules: {len(rough)} (surfaces differ by up to {1e3 * worst:.3g} mm)."
-    if not (pairs := [pair for pair in self_pairs(m) if pair not in touching]):
+    if not (pairs := [pair for pair in self_pairs(m) if pair not in scene.geom_pairs]):
         return
     names = " and ".join(label(m, Kind.mjOBJ_GEOM, geom) for geom in pairs[0])
     count = f"{len(pairs)} pairs of geoms, such as" if len(pairs) > 1 else "the geoms"
@@ -110,9 +110,9 @@ def _ground(scene: Scene) -> Iterator[str]:
 
 def _depth(m: mujoco.MjModel, geom: int) -> float:
     """Return how far [m] a shape reaches beyond its contact points, in the direction where that is farthest."""
-    turned = _directions() @ _axes(m, geom)
-    points = (turned @ contact_points(m, geom)[0].T).max(1) + _directions() @ m.geom_pos[geom]
-    return float((_reach(m, geom) - points).max())
+    data = at_rest(m)
+    points = data.geom_xpos[geom] + contact_points(m, geom)[0] @ data.geom_xmat[geom].reshape(3, 3).T
+    return float((_reach(m, geom) - (_directions() @ points.T).max(1)).max())
 
 
 def _directions() -> NDArray[np.float64]:
@@ -121,15 +121,10 @@ def _directions() -> NDArray[np.float64]:
     return np.stack((level * np.cos(turn), level * np.sin(turn), z), 1)
 
 
-def _axes(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, m.geom_quat[geom])
-    return axes.reshape(3, 3)
-
-
 def _reach(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
-    """Return how far [m] a shape reaches from its body's origin in each direction."""
-    directions, (a, b, c), kind = _directions() @ _axes(m, geom), m.geom_size[geom], m.geom_type[geom]
+    """Return how far [m] a shape reaches from the world's origin in each direction, in the reference pose."""
+    data, (a, b, c), kind = at_rest(m), m.geom_size[geom], m.geom_type[geom]
+    directions = _directions() @ data.geom_xmat[geom].reshape(3, 3)
     x, y, z = abs(directions.T)
     reach = {
         int(Geom.mjGEOM_SPHERE): a + 0 * z,
@@ -139,7 +134,7 @@ def _reach(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
         int(Geom.mjGEOM_ELLIPSOID): np.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2),
     }
     corners = hull(m, m.geom_dataid[geom]) if kind == Geom.mjGEOM_MESH else np.zeros((1, 3))
-    return reach.get(int(kind), (directions @ corners.T).max(1)) + _directions() @ m.geom_pos[geom]
+    return reach.get(int(kind), (directions @ corners.T).max(1)) + _directions() @ data.geom_xpos[geom]
 
 
 def _options(scene: Scene) -> Iterator[str]:

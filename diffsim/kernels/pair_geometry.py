@@ -5,7 +5,8 @@ A block's `kind` tells what its rows are, between the links i (first) and j (sec
     JOINT    q_j - q_j0 - poly(q_i - q_i0) of two joints, or of one; the other two rows are empty
     POINT    a point of j less one of i: <connect>, or a <weld>'s translation
     TURN     the vector part of the quaternion (w, v) of j relative to i, times `torquescale`: a <weld>'s rotation
-    GEOMS    the nearest points of two segments with radii, spheres and capsules, in MuJoCo's frame E of their contact
+    GEOMS    the nearest points of two segments with radii, spheres and capsules, or of a sphere and a box, in MuJoCo's
+             frame E of their contact
 
 J maps the links' twists to E' (A_j - A_i): accelerations of the points for POINT, angular ones for TURN, where
 E' x = torquescale / 2 (w x + x x v) in the frame of i. MuJoCo adds dJ/dt v, the `drift`, to J a of POINT and TURN.
@@ -35,7 +36,7 @@ PARALLEL = 1e-12, 1e-6
 def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of a block's geometry: its points, frame and violation, and their adjoint."""
     t, sp = types(spec), spatial(spec)
-    T, vec3, vec6, mat3 = t.T, t.vec3, t.vec6, t.mat3
+    T, U, vec3, vec6, mat3 = t.T, t.U, t.vec3, t.vec6, t.mat3
     Model, Links, Contacts, force_at, point_velocity = t.Model, t.Links, t.Contacts, sp.force_at, sp.point_velocity
     pick = blocks(spec).pick
     JOINTS, POINTS, TURNS = spec.has("joint_rows point_rows turn_rows")
@@ -165,14 +166,42 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return first, second
 
     @wp.func
+    def has_box(m: Model, s: int):
+        return m.row_shape[s][9] > U(0.0)
+
+    @wp.func
     def segments(m: Model, s: int, links: Links):
-        """Return the centres and the half axes of two geoms: x_1, a_1, x_2, a_2."""
+        """Return the centres and the half axes of two geoms: x_1, a_1, x_2, a_2, which is 0 of a box."""
         c = m.row_shape[s]
         i = m.row_link[2 * s]
         j = m.row_link[2 * s + 1]
         x1 = sp.on_link(links[i].R, links[i].x, m.row_first[s])
         x2 = sp.on_link(links[j].R, links[j].x, m.row_second[s])
-        return x1, links[i].R * vec3(T(c[3]), T(c[4]), T(c[5])), x2, links[j].R * vec3(T(c[6]), T(c[7]), T(c[8]))
+        a2 = links[j].R * vec3(T(c[6]), T(c[7]), T(c[8]))
+        if has_box(m, s):
+            a2 = vec3()
+        return x1, links[i].R * vec3(T(c[3]), T(c[4]), T(c[5])), x2, a2
+
+    @wp.func
+    def box_point(m: Model, s: int, links: Links, from_centre: vec3):
+        """Find the point of a box's surface that is nearest to a sphere's centre.
+
+        Returns:
+            that point, from the box's centre; 1 for each axis of the box along which it follows the sphere, else 0; the
+            box's frame; -1 if the sphere's centre is inside, else 1.
+        """
+        c = m.row_shape[s]
+        R = links[m.row_link[2 * s + 1]].R * mat3(m.row_second_frame[s])
+        y = wp.transpose(R) * from_centre
+        room = vec3(T(c[6]), T(c[7]), T(c[8])) - wp.abs(y)
+        least = wp.min(room[0], wp.min(room[1], room[2]))
+        inside = pick(T(0.0), least, T(1.0), T(0.0))
+        free = vec3()
+        for k in range(3):
+            free[k] = pick(T(0.0), room[k], pick(least, room[k], T(1.0), T(1.0) - inside), T(0.0))
+            surface = pick(T(0.0), y[k], y[k] + room[k], y[k] - room[k])
+            y[k] = pick(T(0.5), free[k], y[k], surface)
+        return R * y, free, R, T(1.0) - T(2.0) * inside
 
     @wp.func
     def clamped(x: T):
@@ -192,6 +221,18 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         moved = clamped((u + mb * s2) / wp.max(ma, T(TINY)))
         s1 = pick(T(0.0), wp.abs(free - s2), moved, s1)
         return s1, s2, (x2 + s2 * a2) - (x1 + s1 * a1)
+
+    @wp.func
+    def nearest_points(m: Model, s: int, links: Links):
+        """Return segments and nearest of two geoms, and -1 inside a box, else 1."""
+        x1, a1, x2, a2 = segments(m, s, links)
+        s1, s2, d = nearest(x1, a1, x2, a2)
+        side = T(1.0)
+        if has_box(m, s):
+            point, free, R, found = box_point(m, s, links, x1 - x2)
+            d = point - (x1 - x2)
+            side = found
+        return x1, a1, x2, a2, s1, s2, d, side
 
     @wp.func
     def contact_frame(d: vec3):
@@ -216,14 +257,13 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         s = contacts[c].row
         r1 = T(m.row_shape[s][1])
         r2 = T(m.row_shape[s][2])
-        x1, a1, x2, a2 = segments(m, s, links)
-        s1, s2, d = nearest(x1, a1, x2, a2)
-        E, length, along, size = contact_frame(d)
+        x1, a1, x2, a2, s1, s2, d, side = nearest_points(m, s, links)
+        E, length, along, size = contact_frame(side * d)
         n = vec3(E[0, 2], E[1, 2], E[2, 2])
         contacts[c].E = E
         contacts[c].p = x1 + s1 * a1 + T(0.5) * (d + (r1 - r2) * n)
         contacts[c].q = contacts[c].p
-        contacts[c].r = length - r1 - r2 - T(m.row_params[s][10])
+        contacts[c].r = side * length - r1 - r2 - T(m.row_params[s][10])
         contacts[c].active = pick(contacts[c].r, T(0.0), T(1.0), T(0.0))
         return contacts[c].active
 
@@ -233,13 +273,12 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
 
         Those of the point are g_p, of the distance g_r, of a rotation of the frame, in the frame, g_turn.
         """
-        x1, a1, x2, a2 = segments(m, s, links)
-        s1, s2, d = nearest(x1, a1, x2, a2)
-        E, length, along, size = contact_frame(d)
+        x1, a1, x2, a2, s1, s2, d, side = nearest_points(m, s, links)
+        E, length, along, size = contact_frame(side * d)
         n = vec3(E[0, 2], E[1, 2], E[2, 2])
         half = T(0.5) * T(m.row_shape[s][1] - m.row_shape[s][2])
         g_n = E * vec3(g_turn[1], -g_turn[0] - along / size * g_turn[2], T(0.0)) + half * (g_p - wp.dot(g_p, n) * n)
-        g_d = pick(T(TINY), length, T(1.0) / length, T(0.0)) * g_n + g_r * n
+        g_d = pick(T(TINY), length, side / length, T(0.0)) * g_n + g_r * n
         g1 = T(0.5) * g_p - g_d
         g2 = T(0.5) * g_p + g_d
         free1 = pick(wp.abs(s1), T(1.0), pick(T(0.0), wp.dot(a1, a1), T(1.0), T(0.0)), T(0.0))
@@ -255,7 +294,12 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         g1 = g1 - m1 * a1 - m2 * a2
         g2 = g2 + m1 * a1 + m2 * a2
         first = force_at(x1 + s1 * a1, g1) + sp.join(m1 * wp.cross(a1, d), vec3())
-        second = force_at(x2 + s2 * a2, g2) + sp.join(m2 * wp.cross(a2, d), vec3())
+        second = force_at(x1 + s1 * a1 + d, g2) + sp.join(m2 * wp.cross(a2, d), vec3())
+        if has_box(m, s):
+            point, free, R, found = box_point(m, s, links, x1 - x2)
+            followed = force_at(x1, R * wp.cw_mul(free, wp.transpose(R) * g2))
+            first = first + followed
+            second = second - followed
         return first, second
 
     return functions(locals())

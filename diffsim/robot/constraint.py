@@ -103,7 +103,7 @@ def check_soft(scene: Scene) -> None:
         names = listed(label(m, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints)
         raise SceneError(f"{scene.name}: soft contact has no frictionloss (joint {names}); choose MuJoCo's contact")
     if scene.geom_pairs:
-        raise SceneError(f"{scene.name}: soft contact has no contact between a robot's parts; choose MuJoCo's contact")
+        raise SceneError(f"{scene.name}: soft contact has no contact between bodies; choose MuJoCo's contact")
     if rows := np.flatnonzero(m.eq_active0).tolist():
         names = listed(label(m, mujoco.mjtObj.mjOBJ_EQUALITY, k) for k in rows)
         raise SceneError(f"{scene.name}: soft contact has no equality constraints ({names}); choose MuJoCo's contact")

@@ -42,7 +42,8 @@ class Pairs(NamedTuple):
     partner: Index  # (n,) the other block of a weld, or itself
     params: Array  # (n, 11) as Constraints.contact
     # (n, 11) of a joint: q_0 of the second and of the first, five coefficients; of a turn: its scale; of two geoms: the
-    # square of the distance where they may touch, radii, and half axes in their links' frames
+    # square of the distance where they may touch, radii, half axes in their links' frames or a box's half lengths, and
+    # 1 if the second is a box
     shape: Array
     first: Array  # (n, 3) m
     second: Array  # (n, 3) m
@@ -73,7 +74,7 @@ class _Rows:
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.m, self.data = scene, scene.mj_model, at_rest(scene.mj_model)
-        capsules = as_capsules(self.m)
+        capsules = as_capsules(self.m) if scene.geom_pairs else self.m
         self.capsules = capsules, at_rest(capsules)
         self.links = list[tuple[Array, Array]]()  # pose of each link at the reference configuration
         for k in range(scene.nlink):
@@ -110,15 +111,19 @@ class _Rows:
 
     def add_geoms(self, a: int, b: int, params: Array) -> None:
         """Append the block of two geoms."""
-        m, data, ends, axes, reach = *self.capsules, list[Frame](), list[Array](), params[10]
-        geoms = sorted((a, b), key=lambda geom: int(m.geom_type[geom]))  # MuJoCo's order: a sphere before a capsule
+        boxed = is_exact(self.m, a, b) and _Geom.mjGEOM_BOX in self.m.geom_type[[a, b]]
+        m, data = (self.m, self.data) if boxed else self.capsules
+        ends, axes, reach = list[Frame](), list[Array](), params[10]
+        geoms = sorted((a, b), key=lambda geom: int(m.geom_type[geom]))  # MuJoCo's order: a sphere comes first
         for geom in geoms:
             end = self.frame(m.geom_bodyid[geom], data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))
             half = m.geom_size[geom, 1] * (m.geom_type[geom] == _Geom.mjGEOM_CAPSULE)
             ends.append(end)
             axes.append(half * end[2][:, 2])
             reach += m.geom_rbound[geom]
-        shape = max(reach, 0.0) ** 2, *m.geom_size[geoms, 0], *np.concatenate(axes)
+        radii, (first, second) = m.geom_size[geoms, 0] * (1.0, 1.0 - boxed), axes
+        second = m.geom_size[geoms[1]] if boxed else second
+        shape = max(reach, 0.0) ** 2, *radii, *first, *second, float(boxed)
         self.add(GEOMS, ends[0], ends[1], params, 0, shape)
 
     def add_equality(self, k: int, row: Row) -> None:
@@ -181,6 +186,12 @@ def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
     return found
 
 
+def is_exact(m: mujoco.MjModel, a: int, b: int) -> bool:
+    """Tell whether two geoms touch each other in their own shapes."""
+    kinds = {_Geom(int(m.geom_type[geom])) for geom in (a, b)}
+    return kinds <= {_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE} or kinds == {_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_BOX}
+
+
 def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
     """Return a copy whose geoms have the shapes that touch each other here: spheres, and capsules in place of the rest.
 
@@ -206,8 +217,8 @@ def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
 def with_pairs(scene: Scene) -> Scene:
     """Return a copy whose parts touch each other as the file lets them, on MuJoCo's contact.
 
-    Shapes other than spheres are capsules, see `as_capsules`. A pair is left out whose capsules overlap in the first
-    keyframe, or the reference pose, though the file's shapes do not.
+    Shapes other than spheres are capsules, see `as_capsules`, except boxes that touch spheres. A pair is left out whose
+    capsules overlap in the first keyframe, or the reference pose, though the file's shapes do not.
 
     Raises:
         SceneError: the numbers of a pair are not simulated.
@@ -219,7 +230,8 @@ def with_pairs(scene: Scene) -> Scene:
         if (solref[0] > 0) != (solref[1] > 0) or (declared is not None and np.ptp(m.pair_friction[declared, :2])):
             names = " and ".join(label(m, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in (a, b))
             raise SceneError(f"{scene.name}: geoms {names}: solref of two signs, or friction that differs by direction")
-        if (a, b) not in overlapping - touching and not {m.geom_type[a], m.geom_type[b]} & UNBOUNDED:
+        overlaps = (a, b) in overlapping - touching and not is_exact(m, a, b)
+        if not overlaps and not {m.geom_type[a], m.geom_type[b]} & UNBOUNDED:
             pairs.append((a, b))
     return dataclasses.replace(scene, geom_pairs=tuple(pairs))
 

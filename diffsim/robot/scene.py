@@ -63,12 +63,12 @@ def takes_euler(m: mujoco.MjModel) -> bool:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """One articulated robot over the ground, in MuJoCo's conventions: SI units, z up.
+    """One robot over the ground, perhaps with other free bodies, in MuJoCo's conventions: SI units, z up.
 
-    Link 0 is the base: the floating body, or the world if the base is fixed. Each further link has one degree of
-    freedom, in MuJoCo's order; bodies with several joints become several links, welded bodies are merged. A link's
-    frame sits at its joint's anchor: R = R_parent rotation Rot(axis, q - q_ref). A ball joint makes three links in a
-    row, all in the frame of the body that it turns and about one axis of it each; only the last has mass.
+    Link 0 is the base: the floating body, or the world if the base is fixed or not alone. Each further link has one
+    degree of freedom, in MuJoCo's order; bodies with several joints become several links, welded bodies are merged. A
+    link's frame sits at its joint's anchor: R = R_parent rotation Rot(axis, q - q_ref). A ball joint makes three links
+    in a row, all in the frame of the body that it turns and about one axis each. Only the last has mass.
 
     Arrays have nlink rows unless said.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 
 import mujoco
@@ -83,4 +84,5 @@ def extreme(motion: Motion, sweep: str, value: float) -> Motion:
         case "drop (m)":
             case.qpos = case.qpos.clone()
             case.qpos[:, 2 if case.scene.floating else 1] += value
+    case.scene = dataclasses.replace(case.scene, geom_pairs=motion.scene.geom_pairs)
     return case
