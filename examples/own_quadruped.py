@@ -44,19 +44,28 @@ class WalkA1(Task):
         return 2.0 - course - 0.1 * turning.square().sum(-1) - 2.0 * (1.0 - up) - effort
 
 
-def play(path: str, seconds: float = 10.0) -> float:
-    """Run an ONNX file in MuJoCo, as a robot's computer would; returns the distance [m]."""
+def play(path: str, task: Task, seconds: float = 10.0, draw: float = 0.5) -> float:
+    """Run an ONNX file in MuJoCo, as a robot's computer would, until a fall; returns the distance [m].
+
+    draw: in [0, 1], in place of the random numbers of the task's memory.
+    """
+    if not path.endswith(".onnx") or not Path(path).is_file():
+        sys.exit(f"{path} is no ONNX file: give one that `diffsim export` has written")
     from onnxruntime import InferenceSession
 
-    policy, task, model = InferenceSession(path), WalkA1(), WalkA1.load_robot().mj_model
+    policy, model = InferenceSession(path), task.load_robot().mj_model
     told = policy.get_modelmeta().custom_metadata_map
     home, scale = (np.array(told[name].split(","), float) for name in ("default_joint_pos", "action_scale"))
     data, action = mujoco.MjData(model), torch.zeros(model.nu)
+    memory = task.begin(torch.full((model.nq + model.nv,), draw))
     mujoco.mj_resetDataKeyframe(model, data, 0)
     for _ in range(round(seconds / task.control_dt)):
         qpos, qvel = (torch.tensor(x, dtype=torch.float32) for x in (data.qpos, data.qvel))
-        obs = task.observe(qpos, qvel, action)[None].numpy()
-        action = torch.tensor(policy.run(["action"], {"observation": obs})[0][0])
+        obs = task.observe_with(qpos, qvel, action, memory)
+        if task.terminated(obs):
+            break
+        action = torch.tensor(policy.run(["action"], {"observation": obs[None].numpy()})[0][0])
+        memory = task.remember(memory, action, memory)
         data.ctrl[:] = home + scale * action.numpy()  # targets of the servos [rad]
         for _ in range(round(task.control_dt / model.opt.timestep)):
             mujoco.mj_step(model, data)
@@ -64,6 +73,4 @@ def play(path: str, seconds: float = 10.0) -> float:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_file():
-        sys.exit("usage: python examples/own_quadruped.py a1.onnx, a file that diffsim export has written")
-    print(f"{play(sys.argv[1]):.2f} m in 10 s")
+    print(f"{play(sys.argv[-1], WalkA1()):.2f} m in 10 s")

@@ -150,4 +150,5 @@ def test_a_robot_of_menagerie_and_its_onnx(tmp_path: Path, monkeypatch: pytest.M
     with torch.no_grad():
         for _ in range(15):
             obs, *_ = env.step(policy(obs))
-    assert sys.modules[type(env.task).__module__].play("a1.onnx", 0.3) == pytest.approx(env.qpos[0, 0].item(), abs=1e-3)
+    distance = sys.modules[type(env.task).__module__].play("a1.onnx", env.task, 0.3)
+    assert distance == pytest.approx(env.qpos[0, 0].item(), abs=1e-3)

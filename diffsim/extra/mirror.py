@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffsim.robot.elements import at_rest
+from diffsim.robot.scene import Array
 from diffsim.tasks.locomotion import Locomotion
 
 VECTOR = (1.0, -1.0, 1.0)  # of a velocity
@@ -88,15 +90,16 @@ def reflections(
     (nq - 7,) and their rates (nv - 6,) that follow a free root.
 
     Args:
-        model: of which left and right are mirror images in the reference configuration. This is not checked.
+        model: of which left and right are mirror images in the reference configuration. Checked are only the frames.
         sides: (right, left) beginnings or ends of names, which a mirror exchanges.
 
     Raises:
         ValueError: a joint or an actuator has no partner of the other side's name, or its axis is another one.
     """
     qpos, qvel, action = (list[tuple[int, float]]() for _ in range(3))  # from where, sign
+    frames = at_rest(model).xmat.reshape(-1, 3, 3)
     for joint, partner in enumerate(partners([model.joint(k).name for k in range(model.njnt)], sides)):
-        positions, rates = _joint_signs(model, joint, partner)
+        positions, rates = _joint_signs(model, frames, joint, partner)
         qpos += enumerate(positions, int(model.jnt_qposadr[partner]))
         qvel += enumerate(rates, int(model.jnt_dofadr[partner]))
     for motor, partner in enumerate(partners([model.actuator(k).name for k in range(model.nu)], sides)):
@@ -106,18 +109,19 @@ def reflections(
     return *whole, *(Reflection(part.index[n:] - n, part.sign[n:]) for part, n in zip(whole, (7, 6), strict=False))
 
 
-def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the signs of the positions and of the rates of a joint."""
-    kind = model.jnt_type[joint]
+def _joint_signs(model: mujoco.MjModel, frames: Array, joint: int, partner: int) -> tuple[list[float], list[float]]:
+    """Return the signs of the positions and of the rates of a joint; frames (nbody, 3, 3) are those of the bodies."""
+    kind, ball = model.jnt_type[joint], model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
     if kind == mujoco.mjtJoint.mjJNT_FREE:
-        return (*VECTOR, *QUATERNION), (*VECTOR, *PSEUDOVECTOR)
-    if kind == mujoco.mjtJoint.mjJNT_BALL:
-        return QUATERNION, PSEUDOVECTOR
-    mirrored = model.jnt_axis[joint] * (VECTOR if kind == mujoco.mjtJoint.mjJNT_SLIDE else PSEUDOVECTOR)
-    sign = float(np.round(mirrored @ model.jnt_axis[partner], 6))
-    if abs(sign) != 1.0:
+        return [*VECTOR, *QUATERNION], [*VECTOR, *PSEUDOVECTOR]
+    own, other = (
+        (np.eye(3) if ball else model.jnt_axis[[k]]) @ frames[model.jnt_bodyid[k]].T for k in (joint, partner)
+    )
+    mirrored = own * (VECTOR if kind == mujoco.mjtJoint.mjJNT_SLIDE else PSEUDOVECTOR)
+    signs = np.round((mirrored * other).sum(1), 6).tolist()
+    if any(abs(sign) != 1.0 for sign in signs):
         raise ValueError(f"the axis of joint {model.joint(partner).name!r} is not the mirror image of the other side's")
-    return (sign,), (sign,)
+    return [1.0] * ball + signs, signs
 
 
 def partners(names: Sequence[str], sides: Sides) -> list[int]:
@@ -126,6 +130,6 @@ def partners(names: Sequence[str], sides: Sides) -> list[int]:
     ends = "|".join(other)
     images = [re.sub(f"^({ends})|({ends})$", lambda side: other[side[0]], name, count=1) for name in names]
     for name, image in zip(names, images, strict=True):
-        if image not in names:
-            raise ValueError(f"{name!r} has no mirror image: there is no {image!r}")
+        if names.count(image) != 1:
+            raise ValueError(f"{name!r} has no mirror image: there is no {image!r}, or more than one")
     return [names.index(image) for image in images]
