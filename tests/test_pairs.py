@@ -186,7 +186,9 @@ def tangle(base, cone, seed):
         shape, name = geom(), next(number)
         return f'<body name="b{name}" pos="{words(*(0.12 * rng.normal(size=3)))}">{joint}{shape}{parts}</body>'
 
-    tree = body(0, "" if base == "fixed" else "<freejoint/>") + body(2, "<freejoint/>") * (base == "objects")
+    tree = body(0, "" if base == "fixed" else "<freejoint/>")
+    if base == "objects":
+        tree += body(2, "<freejoint/>")
     if base == "fixed":
         tree = f'<body name="root">{geom()}{tree}</body>'
     geoms, bodies = re.findall(r'"(g\d+)"', tree), re.findall(r'"(b\d+)"', tree)
