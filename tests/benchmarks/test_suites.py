@@ -16,6 +16,7 @@ import mbpo
 import pfpn
 import pfpn_sac
 import ppo_baseline
+import rpo
 import sac_baseline
 import sapo
 import shac
@@ -28,6 +29,7 @@ SCRIPTS = {
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,
     "ppo_baseline": ppo_baseline.Args,
+    "rpo": rpo.Args,
     "sac_baseline": sac_baseline.Args,
     "shac": shac.Args,
     "sapo": sapo.Args,
