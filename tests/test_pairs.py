@@ -313,6 +313,7 @@ def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
     assert ((residual > 1e-4) == (np.array(numbers) > 2)).all() and 2 in numbers and max(numbers) > 2
 
 
+@SLOW
 def test_contact_in_single_precision_is_near(rng):
     """An environment whose parts touch leaves one beside it alone whose parts do not."""
     scene, states = tangled("floating", "elliptic", 0, 9, rng)

@@ -192,6 +192,7 @@ def test_without_other_values_the_steps_are_those_of_a_simulator() -> None:
     assert all(torch.equal(a, b) for a, b in zip(grads, others, strict=True))
 
 
+@pytest.mark.slow  # for its kernels
 def test_gradients_of_blocks_are_those_of_single_robots() -> None:
     """In float32, where a thread steps several robots; over the steps of a window."""
     scene, states = tree_states("floating", 0, 12, np.random.default_rng(0))
