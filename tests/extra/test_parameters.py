@@ -194,7 +194,7 @@ def test_without_other_values_the_steps_are_those_of_a_simulator() -> None:
 
 @pytest.mark.slow  # for its kernels
 def test_gradients_of_blocks_are_those_of_single_robots() -> None:
-    """In float32, where a thread steps several robots; over the steps of a window."""
+    """In float32, where a thread steps several robots; over the steps of a rollout."""
     scene, states = tree_states("floating", 0, 12, np.random.default_rng(0))
     grads = []
     for dtype, block in ((torch.float64, 1), (torch.float32, 8)):
@@ -242,7 +242,7 @@ def test_elements_and_which_of_them_may_differ() -> None:
     assert rough == ["FL", "FR", "RL", "RR"]
 
 
-def test_parameters_change_between_windows_only() -> None:
+def test_parameters_change_between_rollouts_only() -> None:
     sim, _, states = parametric("Euler's servos")
     start = [torch.tensor(x) for x in states]
     sim.parameters = {"mass": (mass := sim.parameters["mass"].requires_grad_())}
