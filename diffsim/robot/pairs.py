@@ -224,13 +224,13 @@ def with_pairs(scene: Scene) -> Scene:
         SceneError: the numbers of a pair are not simulated.
     """
     m, pairs = scene.mj_model, list[tuple[int, int]]()
-    touching, overlapping = (touching_pairs(model) for model in (m, as_capsules(m)))
+    declarations, overlapping = declared_pairs(m), touching_pairs(as_capsules(m)) - touching_pairs(m)
     for a, b in self_pairs(m):
-        declared, solref = declared_pairs(m).get((a, b)), pair_law(m, a, b).solref
+        declared, solref = declarations.get((a, b)), pair_law(m, a, b).solref
         if (solref[0] > 0) != (solref[1] > 0) or (declared is not None and np.ptp(m.pair_friction[declared, :2])):
             names = " and ".join(label(m, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in (a, b))
             raise SceneError(f"{scene.name}: geoms {names}: solref of two signs, or friction that differs by direction")
-        overlaps = (a, b) in overlapping - touching and not is_exact(m, a, b)
+        overlaps = (a, b) in overlapping and not is_exact(m, a, b)
         if not overlaps and not {m.geom_type[a], m.geom_type[b]} & UNBOUNDED:
             pairs.append((a, b))
     return dataclasses.replace(scene, geom_pairs=tuple(pairs))
