@@ -278,6 +278,51 @@ def test_spheres_touch_boxes_as_in_mujoco(cone, rng):
     check_gradients(scene, [x[:8] for x in states], rng)
 
 
+def crawler(cone):
+    """A body on four legs over stairs, one of whose steps is tilted, a fixed ball, a fixed rod and the ground."""
+    steps = "".join(
+        f'<geom type="box" pos="{0.2 * k} 0 {0.05 * k}" size=".1 .5 .05" euler="0 {10 * (k == 3)} 0"/>'
+        for k in range(-2, 4)
+    )
+    legs = "".join(
+        f"""<body pos="{x} {y} 0"> <joint axis="0 1 0" range="-60 60"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.15" size=".02" contype="2" conaffinity="2"/>
+        <geom pos="0 0 -.18" size=".03" friction=".8"/> </body>"""
+        for x in (-0.15, 0.15)
+        for y in (-0.1, 0.1)
+    )
+    return parse(f"""<mujoco> <option cone="{cone}"/> <worldbody> <geom type="plane" size="1 1 1"/>
+        {steps} <geom size=".1" pos="-.2 .1 .2"/>
+        <body pos=".1 .2 .2"> <geom type="capsule" size=".03 .2" euler="90 0 20" contype="3" conaffinity="3"/> </body>
+        <body> <freejoint/> <geom type="box" size=".1 .1 .03" contype="0" conaffinity="0"/> {legs} </body>
+        </worldbody></mujoco>""")
+
+
+@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
+def test_fixed_geoms_are_touched_as_in_mujoco(cone, rng):
+    """Without `with_pairs` by a robot whose parts do not touch each other."""
+    scene, n = crawler(cone), 64
+    qpos, qvel, ctrl = free_states(scene, n, rng)
+    qpos[:, :3] = rng.uniform((-0.3, -0.2, 0.15), (0.4, 0.2, 0.4), (n, 3))
+    qpos[:, 3:7] = np.array([1, 0, 0, 0]) + 0.2 * rng.normal(size=(n, 4))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    states, touched = (qpos, 0.3 * qvel, ctrl), 0
+    whole = with_pairs(scene)
+    for each, model in ((scene, apart_from_itself(scene)), (whole, model_as_it_is(scene))):
+        expected, found = in_mujoco(scene, *states, model=model)[1], step(each, states)[1]
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+        touched = (abs(found - step(dataclasses.replace(scene, geom_pairs=()), states)[1]).max(1) > 1e-3).sum()
+    assert len(scene.geom_pairs) == 4 * 6 + 4 + 8 and len(whole.geom_pairs) == 36 + 12 and touched > n / 2
+    check_gradients(scene, [x[:6] for x in states], rng)
+
+
+def apart_from_itself(scene):
+    """The file's model, whose moving geoms touch fixed ones only."""
+    m, moves = model_as_it_is(scene), scene.mj_model.body_weldid[scene.mj_model.geom_bodyid] > 0
+    m.geom_conaffinity[moves] = 0
+    return m
+
+
 def test_other_shapes_touch_as_their_capsules(rng):
     """Which MuJoCo has in their place here."""
     arms = ""

@@ -24,6 +24,7 @@ POINTS = {
     int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): np.concatenate((np.eye(3), -np.eye(3), _CORNERS / np.sqrt(3))),
     int(mujoco.mjtGeom.mjGEOM_MESH): np.zeros((HULL_POINTS, 3)),
 }
+UNBOUNDED = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SDF")]
 
 
 class PairLaw(NamedTuple):
@@ -37,19 +38,19 @@ class PairLaw(NamedTuple):
 
 
 def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
-    """List (fixed geom, moving geom) that may touch; geoms of the robot's own base are no ground."""
+    """List (ground, moving geom) that may touch; fixed geoms of bounded shapes are no ground (robot/pairs.py)."""
     weld = m.body_weldid[m.geom_bodyid]
-    moving, ground = np.flatnonzero(weld), np.flatnonzero((weld == 0) & ~base_geoms(m))
+    moving, ground = np.flatnonzero(weld), np.flatnonzero((weld == 0) & np.isin(m.geom_type, UNBOUNDED))
     pairs = {(s, g): None for s in ground.tolist() for g in moving[collide(m, s, moving)].tolist()}
     sides = {(s, g): None for pair in declared_pairs(m) for s, g in (pair, pair[::-1]) if weld[g] and s in ground}
     return list(pairs | sides)
 
 
 def base_geoms(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Mark geoms (ngeom,) of bodies fixed to the world with moving children, without planes and height fields."""
+    """Mark geoms (ngeom,) of bodies fixed to the world with moving children, without unbounded ones."""
     carries = np.isin(m.body_rootid, m.body_rootid[m.body_weldid > 0])
-    flat = (m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (m.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
-    return carries[m.geom_bodyid] & (m.body_weldid[m.geom_bodyid] == 0) & (m.geom_bodyid > 0) & ~flat
+    fixed = (m.body_weldid[m.geom_bodyid] == 0) & ~np.isin(m.geom_type, UNBOUNDED)
+    return carries[m.geom_bodyid] & (m.geom_bodyid > 0) & fixed
 
 
 def declared_pairs(m: mujoco.MjModel) -> dict[tuple[int, int], int]:

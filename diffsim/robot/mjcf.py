@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from diffsim.robot.contact import contact_points, ground_pairs
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, numeric, servos
-from diffsim.robot.pairs import with_pairs
+from diffsim.robot.pairs import with_obstacles, with_pairs
 from diffsim.robot.refuse import beyond, obstacles, strays
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
 
@@ -48,7 +48,7 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     scene = dataclasses.replace(_Reader(model, file).scene(), left_out=tuple(left_out))
     _refuse(file, beyond(scene))
     beside = model.ntree > 1 and Joint.mjJNT_FREE in model.jnt_type
-    return with_pairs(scene) if beside else scene
+    return with_pairs(scene) if beside else with_obstacles(scene)
 
 
 def _refuse(file: Path, found: list[str]) -> None:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.contact import base_geoms, collide, declared_pairs, pair_law
+from diffsim.robot.contact import UNBOUNDED, base_geoms, collide, declared_pairs, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
 from diffsim.robot.scene import Array, Index, Scene, SceneError
 
@@ -22,7 +22,6 @@ NAMES = "joint", "point", "turn", "geoms"
 _Geom = mujoco.mjtGeom
 SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "BOX", "MESH")]  # made capsules
 MOST_PAIRS = 64  # of geoms that touch at once, in the environments that a thread steps together
-UNBOUNDED = {int(_Geom.mjGEOM_PLANE), int(_Geom.mjGEOM_HFIELD), int(_Geom.mjGEOM_SDF)}
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
 
 
@@ -171,11 +170,11 @@ class _Rows:
 
 
 def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
-    """List the pairs of the robot's geoms that may touch each other: MuJoCo's filters."""
+    """List the pairs of geoms, without the ground, that may touch each other: MuJoCo's filters."""
     weld, found = m.body_weldid[m.geom_bodyid], list[tuple[int, int]]()
     parent = m.body_weldid[m.body_parentid[weld]]
     filters = "filterparent" not in disabled_flags(m)
-    parts = np.flatnonzero((weld > 0) | base_geoms(m))
+    parts = np.flatnonzero((weld > 0) | ~np.isin(m.geom_type, UNBOUNDED))
     declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
     for k, a in enumerate(parts.tolist()):
         b = parts[k + 1 :]
@@ -184,6 +183,18 @@ def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
         touch |= np.isin(b, [second for first, second in declared if first == a])
         found += [(a, other) for other in b[touch].tolist()]
     return found
+
+
+def obstacle_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
+    """List those with a fixed geom that is no part of the robot's base, such as a step of stairs."""
+    fixed = (m.body_weldid[m.geom_bodyid] == 0) & ~base_geoms(m)
+    return [pair for pair in self_pairs(m) if fixed[list(pair)].any()]
+
+
+def rough_obstacles(m: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Mark fixed geoms (ngeom,) that something would touch in other shapes than the file's."""
+    rough = [pair for pair in obstacle_pairs(m) if not is_exact(m, *pair)]
+    return np.isin(range(m.ngeom), rough) & (m.body_weldid[m.geom_bodyid] == 0)
 
 
 def is_exact(m: mujoco.MjModel, a: int, b: int) -> bool:
@@ -215,7 +226,7 @@ def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def with_pairs(scene: Scene) -> Scene:
-    """Return a copy whose parts touch each other as the file lets them, on MuJoCo's contact.
+    """Return a copy whose parts touch each other and fixed geoms as the file lets them, on MuJoCo's contact.
 
     Shapes other than spheres are capsules, see `as_capsules`, except boxes that touch spheres. A pair is left out whose
     capsules overlap in the first keyframe, or the reference pose, though the file's shapes do not.
@@ -223,15 +234,25 @@ def with_pairs(scene: Scene) -> Scene:
     Raises:
         SceneError: the numbers of a pair are not simulated.
     """
+    return _with(scene, self_pairs(scene.mj_model))
+
+
+def with_obstacles(scene: Scene) -> Scene:
+    """Return a copy whose parts touch fixed geoms beside the ground, and not each other; itself without such geoms."""
+    pairs = obstacle_pairs(scene.mj_model)
+    return _with(scene, pairs) if pairs else scene
+
+
+def _with(scene: Scene, candidates: list[tuple[int, int]]) -> Scene:
     m, pairs = scene.mj_model, list[tuple[int, int]]()
     declarations, overlapping = declared_pairs(m), touching_pairs(as_capsules(m)) - touching_pairs(m)
-    for a, b in self_pairs(m):
+    for a, b in candidates:
         declared, solref = declarations.get((a, b)), pair_law(m, a, b).solref
         if (solref[0] > 0) != (solref[1] > 0) or (declared is not None and np.ptp(m.pair_friction[declared, :2])):
             names = " and ".join(label(m, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in (a, b))
             raise SceneError(f"{scene.name}: geoms {names}: solref of two signs, or friction that differs by direction")
         overlaps = (a, b) in overlapping and not is_exact(m, a, b)
-        if not overlaps and not {m.geom_type[a], m.geom_type[b]} & UNBOUNDED:
+        if not overlaps and not {m.geom_type[a], m.geom_type[b]} & set(UNBOUNDED):
             pairs.append((a, b))
     return dataclasses.replace(scene, geom_pairs=tuple(pairs))
 

@@ -43,10 +43,8 @@ def asset(geom: str, content: str) -> str:
     return pendulum(inside=f'<geom name="rock" {geom}/>', rest=f"<asset>{content}</asset>")
 
 
-ROCK = (
-    '<worldbody><geom name="rock" size="1" contype="0"/></worldbody><contact><pair geom1="a" geom2="rock"/></contact>'
-)
 HILLS = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
+TETRAHEDRON = '<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
 FIXED = '<tendon><fixed name="string"><joint joint="hinge" coef="1"/></fixed></tendon>'
 RAG = '<flex name="rag" dim="1" body="arm arm" vertex="0 0 0 1 0 0" element="0 1"/>'
 REFUSED = {  # what the variants of test_variants.py have not
@@ -90,16 +88,15 @@ REFUSED = {  # what the variants of test_variants.py have not
         inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'
     ),
     "geom 'floor': solmix must not be negative": pendulum(world=FLOOR.replace("/>", ' solmix="-1"/>')),
-    "geom 'rock': contact is simulated with one ground plane only; set contype and conaffinity to 0 if only drawn": [
-        pendulum(world='<geom name="rock" type="box" size="1 1 1"/>'),
-        pendulum(world='<body><geom name="rock" type="box" size="1 1 1"/></body>'),
-        pendulum(world='<geom name="rock" type="hfield" hfield="h"/>', rest=HILLS),
-        pendulum(world="", inside='<geom name="a" size="0.1"/>', rest=ROCK),
+    "geom 'rock': contact is simulated with one ground plane only; set contype and conaffinity to 0 if only drawn": (
+        pendulum(world='<geom name="rock" type="hfield" hfield="h"/>', rest=HILLS)
+    ),
+    "geom 'rock': fixed boxes touch spheres only, and other shapes are no obstacles; set contype": [
+        pendulum(world='<geom name="rock" type="cylinder" size="1 1 1"/>'),
+        pendulum(world='<body><geom name="rock" type="mesh" mesh="m"/></body>', rest=f"<asset>{TETRAHEDRON}</asset>"),
     ],
     "geom 'floor', 'second': contact is simulated with one": pendulum(world=FLOOR + FLOOR.replace("floor", "second")),
-    "geom 'rock': its shape cannot touch the ground here; set contype": asset(
-        'type="sdf" mesh="m"', '<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
-    ),
+    "geom 'rock': its shape cannot touch the ground here; set contype": asset('type="sdf" mesh="m"', TETRAHEDRON),
     "pair 'couple': margin must be finite": pair('margin="inf"'),
     "joint 'hinge': margin must be finite": pendulum('margin="nan"'),
     "option impratio: must be positive and finite": [
