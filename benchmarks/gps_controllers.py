@@ -189,7 +189,7 @@ def main(args: Args) -> None:
         for row in leaving(env, iterations):
             args.keep("gps_stability", row, LEFT)
     shown = [row for row in args.read("gps_controllers") if row["env"] != "humanoid"]  # whose policies fall everywhere
-    args.publish("gps terrain", markdown(table(shown)), "gps.md", everywhere=True)
+    args.publish("gps terrain", markdown(table(shown)), "benchmarks.md", everywhere=True)
     args.publish("gps stability", markdown(rates(args.read("gps_stability"))), "", everywhere=True)
 
 

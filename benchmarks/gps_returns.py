@@ -10,11 +10,11 @@ from statistics import mean
 from common import CommonFlags, run
 from tables import grouped, numbers
 
-GROUPS = {"walker_short": "walker, which falls at once after the pretraining", "hopper_short": "hopper, likewise"}
+GROUPS = {"walker_short": "walker", "hopper_short": "hopper"}  # whose networks fall when the search begins
 NAMES = {
     "full": "guided policy search",
     "20-units": "with 20 units",
-    "one-start": "from one start in line 7",
+    "one-start": "search from the last policy only",
     "nonguided": "without guides",
     "20-units-nonguided": "with 20 units, without guides",
     "unregularized": "without the regularizer",
@@ -38,9 +38,7 @@ def main(args: CommonFlags) -> None:
             returns = numbers(found.get((group, cell), []), "end")
             axis.plot(returns, [-place] * len(returns), "C0o" if cell in ("full", "20-units") else "C1o", alpha=0.7)
         axis.axvline(mean(numbers(found[group, "full"], "guides")), color="k", linestyle="--", linewidth=1)
-        axis.set(
-            title=title, xlabel="return (dashed: of the guides)", xscale="symlog", yticks=range(0, -len(NAMES), -1)
-        )
+        axis.set(title=title, xlabel="return (dashed: guides)", xscale="symlog", yticks=range(0, -len(NAMES), -1))
         axis.set_yticklabels(NAMES.values())
         axis.set_xlim(-2600, -50)
         axis.xaxis.set_major_formatter("{x:.0f}")
