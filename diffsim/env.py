@@ -237,7 +237,7 @@ class DiffEnv(VectorEnv):
         self._episode_return.masked_fill_(mask, 0.0)
 
     def compile(self) -> None:
-        """Fuse what a step does beside the simulator into a few kernels of torch.compile, made at the next steps."""
+        """Compile what a step does outside the simulator with torch.compile, when the next steps are taken."""
         self._judge = torch.compile(self._judge, dynamic=False)  # type: ignore[method-assign]
         self._conclude = torch.compile(self._conclude, dynamic=False)  # type: ignore[method-assign]
         if type(self.task).disturb is not Task.disturb:
