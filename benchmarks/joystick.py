@@ -54,6 +54,7 @@ class Args(common.ServoFlags):
     gains: tuple[Positive, ...] = (1.0,)  # of the servos' stiffness and damping
     latency: Annotated[float, Range("from 0 to 40", lambda ms: 0 <= ms <= 40)] = 0.0  # ms by which actions come late
     seconds: Long = 20.0  # of an episode
+    own: str | None = None  # FILE:CLASS of the policies' own task, whose code runs
     rough: tuple[Slope, ...] = ()  # degrees, steepest slopes of rough ground, 0: the file's plane
 
 
@@ -100,7 +101,7 @@ def training(case: Case) -> dict[str, object]:
 
 def measure(args: Args, path: Path) -> Iterator[Row]:
     """A row for each friction, mass and gains."""
-    case = load_case(path, 1, "cpu")
+    case = load_case(path, 1, "cpu", args.own)
     if not isinstance(task := case.env.task, Joystick):
         fail(f"{path} was trained on {task.name}, which follows no command")
     for slope, friction, mass, gains in product(args.rough or (0.0,), args.friction, args.mass, args.gains):

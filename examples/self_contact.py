@@ -1,0 +1,40 @@
+"""A G1 whose legs touch each other in training, so that its reward needs no term for them; docs/own_robot.md.
+
+python rpo.py --env examples/self_contact.py:Whole --horizon 16 --adjoint-clip 5 --initial-log-std -3
+python benchmarks/joystick.py runs/<run> --own examples/self_contact.py:Whole --push 1 --file <Menagerie's scene.xml>
+"""
+
+from itertools import product
+
+import mujoco
+
+from diffsim.extra.robots.joystick import G1, humanoid
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.pairs import with_pairs
+from diffsim.robot.scene import Scene
+from diffsim.tasks.base import ASSETS
+
+LEG = "hip_roll", "hip_yaw", "knee", "ankle_roll"  # links whose first geoms touch those of the other leg
+
+
+class Ghost(G1):
+    """A G1 whose legs pass through each other, as the shipped one's, without a reward for feet that stay apart."""
+
+    name, robot = "ghost", humanoid()._replace(apart=0.0)
+
+
+class Whole(Ghost):
+    """A G1 whose legs touch each other."""
+
+    name, robot = "whole", Ghost.robot
+
+    @classmethod
+    def load_robot(cls) -> Scene:
+        spec = mujoco.MjSpec.from_file(str(ASSETS / cls.asset))
+        sides = [[spec.body(f"{side}_{link}_link").first_geom() for link in LEG] for side in ("left", "right")]
+        for geoms, side in zip(sides, ("left", "right"), strict=True):
+            for geom, link in zip(geoms, LEG, strict=True):
+                geom.name = f"{side}_{link}"
+        for left, right in product(*sides):
+            spec.add_pair(geomname1=left.name, geomname2=right.name)
+        return with_pairs(load_scene(spec))
