@@ -445,7 +445,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(LEARNED):
                 parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_factors)
             if wp.static(PAIRS):
-                pairs.add_adjoint(m, here, links, contacts, nodes, adj)
+                pairs.add_adjoint(m, here, links, contacts, nodes, adj, adj_factors)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):

@@ -19,6 +19,7 @@ import warp as wp
 from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.lane import K_D, K_N, MU
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.pair_geometry import pair_geometry
 from diffsim.kernels.pair_solver import row_solver
@@ -42,7 +43,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     Model, Lane, Ck, Links, Contacts, Motions, Loads = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Motions Loads".split()
     )
-    Nodes, Adjoints, Root, Newton, force_at = t.Nodes, t.Adjoints, t.Root, t.Newton, sp.force_at
+    Nodes, Adjoints, Root, Newton, Array, force_at = t.Nodes, t.Adjoints, t.Root, t.Newton, t.Ts, sp.force_at
     FLOATING, NV, SOLVES, PAIRS, WORLD = spec.floating, spec.nv, spec.solves, spec.pairs, spec.room - 1
     EQUALITIES, NPOINTS, LAST = spec.pair_sizes.equalities, spec.pair_sizes.points, spec.pair_sizes.blocks - 1
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
@@ -50,6 +51,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     BASE, VADR = 7 * (spec.nlink - 1), spec.dof0 - 1
     JOINTS, POINTS, TURNS, TOUCH = spec.has("joint_rows point_rows turn_rows geoms_rows")
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]
+    VARIED, LEARNED, COLUMNS = spec.varied, spec.parameters > 0, spec.parameters - 2 * PAIRS  # see parameters.py
 
     @wp.func
     def place_world(links: Links, origin: vec3):
@@ -79,7 +81,17 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         return r, vec3(wp.sqrt(wp.dot(r, r) + wp.dot(other, other)), T(0.0), T(0.0))
 
     @wp.func
-    def law(m: Model, s: int, D: T, jar: vec3, sticking: T):
+    def constants(m: Model, here: Lane, s: int):
+        """Return a block's factor of k, its b and its friction; factors of the environment are those of geoms."""
+        params = m.row_params[s]
+        result = vec3(T(1.0), T(params[1]), T(params[2]))
+        if wp.static(VARIED):
+            if m.row_kind[s] == GEOMS:
+                result = vec3(here.k_n, wp.sqrt(here.k_n) * T(params[1]), here.mu * T(params[2]))
+        return result
+
+    @wp.func
+    def law(m: Model, here: Lane, s: int, D: T, jar: vec3, sticking: T):
         """Return the force of the rows, and H, minus its derivatives in jar; sticking as in cone.py."""
         H = D * wp.identity(3, dtype=T)
         if wp.static(JOINTS):
@@ -88,15 +100,19 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         f = -(H * jar)
         if wp.static(TOUCH):
             if m.row_kind[s] == GEOMS:
-                f, H = cone.force(D, T(m.row_params[s][2]), T(m.row_params[s][3]), jar, sticking)
+                f, H = cone.force(D, constants(m, here, s)[2], T(m.row_params[s][3]), jar, sticking)
         return f, H
 
     @wp.func
-    def geoms_state(m: Model, c: int, contacts: Contacts):
+    def geoms_state(m: Model, here: Lane, c: int, contacts: Contacts):
         """Return the impedance_row of two geoms, with D = 0 beyond the margin."""
-        params = m.row_params[contacts[c].row]
-        state = constraint.impedance_row(params, T(1.0), wp.min(contacts[c].r, T(0.0)))
-        return vec4(contacts[c].active * state[0], state[1], state[2], state[3])
+        s = contacts[c].row
+        stiffness = constants(m, here, s)[0]
+        state = constraint.impedance_row(m.row_params[s], stiffness, wp.min(contacts[c].r, T(0.0)))
+        D = contacts[c].active * state[0]
+        if wp.static(VARIED):
+            D = here.k_d * D
+        return vec4(D, state[1], state[2], state[3])
 
     @wp.func
     def list_blocks(m: Model, here: Lane, links: Links, contacts: Contacts):
@@ -132,13 +148,13 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         return end
 
     @wp.func
-    def rest_of(m: Model, c: int, links: Links, contacts: Contacts):
+    def rest_of(m: Model, here: Lane, c: int, links: Links, contacts: Contacts):
         """Return D of a block, and jar without velocity and acceleration."""
         s = contacts[c].row
         D = T(0.0)
         rest = vec3()
         if m.row_kind[s] == GEOMS:
-            state = geoms_state(m, c, contacts)
+            state = geoms_state(m, here, c, contacts)
             D = state[0]
             rest[2] = state[2]
         else:
@@ -159,11 +175,11 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
             s = contacts[c].row
             i = m.row_link[2 * s]
             j = m.row_link[2 * s + 1]
-            D, rest = rest_of(m, c, links, contacts)
+            D, rest = rest_of(m, here, c, links, contacts)
             velocity = geometry.rates(m, c, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
-            jar = T(m.row_params[s][1]) * velocity + rest
+            jar = constants(m, here, s)[1] * velocity + rest
             jar = jar + geometry.drift(m, c, links, contacts, motions[i].accel_link, motions[j].accel_link)
-            f, H = law(m, s, D, jar, T(1.0))
+            f, H = law(m, here, s, D, jar, T(1.0))
             contacts[c].D = D
             contacts[c].jar = jar
             contacts[c].f = f
@@ -214,7 +230,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
             j = m.row_link[2 * s + 1]
             step_jar = geometry.rates(m, c, contacts, motions[i].A, motions[j].A, motions[i].u, motions[j].u)
             jar = contacts[c].jar + alpha * step_jar
-            f, H = law(m, s, contacts[c].D, jar, T(0.0))
+            f, H = law(m, here, s, contacts[c].D, jar, T(0.0))
             force_error = contacts[c].f - alpha * contacts[c].Hs - f
             w = T(m.row_params[s][4])
             accel_error = constraint.acceleration_for(force_error, w, H)
@@ -252,10 +268,10 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         end = list_blocks(m, here, links, contacts)
         for c in range(here.begin, end):
             s = contacts[c].row
-            D, rest = rest_of(m, c, links, contacts)
+            D, rest = rest_of(m, here, c, links, contacts)
             for axis in range(3):
                 contacts[c].jar[axis] = kin.load(ck.a, here.row, COLUMN + 3 * s + axis, here.e)
-            f, H = law(m, s, D, contacts[c].jar, T(0.0))
+            f, H = law(m, here, s, D, contacts[c].jar, T(0.0))
             contacts[c].f = f
             contacts[c].H = H
         return end
@@ -408,16 +424,45 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         return wp.cross(g, wp.spatial_top(motion)) - wp.cross(f, wp.spatial_top(nodes[i].W))
 
     @wp.func
-    def geoms_adjoint(m: Model, c: int, rate: vec3, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints):
+    def add_constants_adjoint(
+        m: Model, here: Lane, c: int, rate: vec3, links: Links, contacts: Contacts, adj_factors: Array
+    ):
+        """Add the derivatives by factors or parameters of a block's part, -f . rate."""
+        s = contacts[c].row
+        f_rate = wp.dot(contacts[c].f, rate)
+        if wp.static(LEARNED):
+            adj_factors[COLUMNS + 2 * s + 1] = adj_factors[COLUMNS + 2 * s + 1] + f_rate
+        if wp.static(TOUCH and (VARIED or LEARNED)):
+            if m.row_kind[s] == GEOMS:
+                coef = constants(m, here, s)
+                jar = contacts[c].jar
+                state = geoms_state(m, here, c, contacts)
+                by_mu = cone.friction_derivative(state[0], coef[2], T(m.row_params[s][3]), jar, rate)
+                if wp.static(LEARNED):
+                    adj_factors[COLUMNS + 2 * s] = adj_factors[COLUMNS + 2 * s] - by_mu
+                if wp.static(VARIED):
+                    g = contacts[c].H * rate
+                    i = m.row_link[2 * s]
+                    j = m.row_link[2 * s + 1]
+                    velocity = geometry.rates(m, c, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
+                    by_k = T(0.5) * coef[1] * wp.dot(g, velocity) + g[2] * state[2]
+                    adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
+                    adj_factors[K_D] = adj_factors[K_D] - f_rate / here.k_d
+                    adj_factors[MU] = adj_factors[MU] - T(m.row_params[s][2]) * by_mu
+
+    @wp.func
+    def geoms_adjoint(
+        m: Model, here: Lane, c: int, rate: vec3, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints
+    ):
         """Add the part of two geoms' block, with that rate under lambda, as constraint.add_contacts_adjoint."""
         s = contacts[c].row
         i = m.row_link[2 * s]
         j = m.row_link[2 * s + 1]
-        b = T(m.row_params[s][1])
+        b = constants(m, here, s)[1]
         E = contacts[c].E
         f = contacts[c].f
         g = contacts[c].H * rate
-        state = geoms_state(m, c, contacts)
+        state = geoms_state(m, here, c, contacts)
         g_r = g[2] * state[3] - wp.dot(f, rate) * state[1]
         g_turn = wp.cross(g, contacts[c].jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, rate)
         g_p = add_end_adjoint(i, contacts[c].p, b, -(E * g), -(E * f), links, nodes, adj)
@@ -427,13 +472,17 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         adj[j].p = adj[j].p + second
 
     @wp.func
-    def add_adjoint(m: Model, here: Lane, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints):
-        """Add the rows' part of phi, -f . rate under lambda, to the adjoints of links and joints."""
+    def add_adjoint(
+        m: Model, here: Lane, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints, adj_factors: Array
+    ):
+        """Add the rows' part of phi, -f . rate under lambda, to the adjoints of links, joints and constants."""
         for c in range(here.begin, here.end):
             rate = lambda_rates(m, c, contacts, nodes)
+            if wp.static(VARIED or LEARNED):
+                add_constants_adjoint(m, here, c, rate, links, contacts, adj_factors)
             if m.row_kind[contacts[c].row] == GEOMS:
                 if wp.static(TOUCH):
-                    geoms_adjoint(m, c, rate, links, contacts, nodes, adj)
+                    geoms_adjoint(m, here, c, rate, links, contacts, nodes, adj)
             else:
                 equality_adjoint(m, here, c, rate, links, contacts, nodes, adj)
 
