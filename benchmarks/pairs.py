@@ -31,8 +31,9 @@ from speed import race, timer
 from tables import Row
 
 from diffsim import Integration, Scene, Simulator, load_scene
+from diffsim.kernels.pair_adjoint import ACCURACY_ADJOINT
 from diffsim.kernels.pair_solver import ROUND_OFF
-from diffsim.kernels.pairs import ACCURACY, ACCURACY_ADJOINT
+from diffsim.kernels.pairs import ACCURACY
 from diffsim.robot.elements import control_range
 from diffsim.robot.pairs import as_capsules, with_pairs
 from diffsim.robot.scene import Array
