@@ -329,7 +329,7 @@ def test_what_no_robot_has_is_refused_in_one_line() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", ["floating", "bounded servos"])
+@pytest.mark.parametrize("name", ["floating", "bounded servos", "touching"])
 def test_gradients_on_a_gpu_are_the_cpus(name: str, rng: np.random.Generator) -> None:
     cpu, scene, states = parametric(name)
     values, grads = other_values(cpu, rng), []
