@@ -11,8 +11,8 @@ PACKAGE = Path(diffsim.__file__).parent
 CONTRIBUTING = PACKAGE.parent / "CONTRIBUTING.md"
 # Laws that the core has as features of a KernelSpec, and that the paper's six tasks do without
 OPTIONAL = """kernels/constraint kernels/newton kernels/drag kernels/force kernels/terrain kernels/lanes
-kernels/exchange kernels/cone kernels/records kernels/pairs kernels/pair_geometry kernels/pair_solver
-kernels/parameters robot/pairs robot/constraint robot/terrain robot/drag sim/tangent sim/adjoint
+kernels/exchange kernels/cone kernels/records kernels/pairs kernels/pair_adjoint kernels/pair_geometry
+kernels/pair_solver kernels/parameters robot/pairs robot/constraint robot/terrain robot/drag sim/tangent sim/adjoint
 sim/elevation""".split()
 
 

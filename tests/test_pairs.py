@@ -20,7 +20,7 @@ from diffsim.extra.report import approximations
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
 from diffsim.robot.pairs import as_capsules, with_pairs
-from diffsim.robot.scene import SceneError
+from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
@@ -244,6 +244,28 @@ def test_gradient_through_contact_is_that_of_differences(base, cone, rng):
         calm = np.argsort(np.where(touches, abs(ends).max(1), np.inf))[:6]
         assert touches[calm].all()
         check_gradients(scene, [x[calm] for x in states], rng)
+
+
+@needs_drift
+@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
+def test_factors_act_on_contact_between_bodies(cone, rng):
+    """Those of friction and stiffness as in MuJoCo with other constants; gradients are those of differences."""
+    scene, states = tangled("objects", cone, 0, 64, rng)
+    m, factors = model_as_it_is(scene), np.ones((64, len(FACTORS)))
+    factors[:, [FACTORS.index("k_n"), FACTORS.index("mu")]] = 1.3, 0.6
+    m.geom_friction[:], m.pair_friction[:] = 0.6 * m.geom_friction, 0.6 * m.pair_friction
+    for solref in (m.geom_solref, m.pair_solref):
+        time, stiffness = (solref > 0).all(1), (solref < 0).all(1)
+        solref[time, 0] /= np.sqrt(1.3)
+        solref[stiffness] *= 1.3, np.sqrt(1.3)
+    expected, usual = (in_mujoco(scene, *states, model=model)[1] for model in (m, model_as_it_is(scene)))
+    found = step(scene, states, factors=torch.tensor(factors))[1]
+    change = abs(expected - states[1]).max(1)
+    np.testing.assert_array_less(abs(found - expected).max(1), 1e-6 * change)
+    slides = abs(usual - expected).max(1) > 1e-3 * change
+    calm = np.argsort(np.where(slides, abs(found).max(1), np.inf))[:6]  # as above
+    assert slides[calm].all()
+    check_gradients(scene, [x[calm] for x in states], rng, {"factors": rng.uniform(0.7, 1.4, (6, len(FACTORS)))})
 
 
 def marbles(cone, seed):

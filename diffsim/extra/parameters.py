@@ -26,7 +26,7 @@ from torch import Tensor
 from diffsim.kernels import parameters as columns
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.model import model_of
-from diffsim.robot.constraint import LEAST_FRICTION, constrained
+from diffsim.robot.constraint import LEAST_FRICTION, LEAST_WEIGHT, constrained
 from diffsim.robot.contact import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos
 from diffsim.robot.mjcf import load_scene
@@ -50,7 +50,7 @@ FIELDS: dict[str, tuple[str, Any]] = {
 # Fields of Scene and of the kernels' Model that depend on them
 OF_SCENE = """mass com inertia armature damping stiffness spring_ref servo_stiffness servo_damping servo_ref gear
 motor_bias""".split()
-OF_MODEL = [*OF_SCENE, "contact_params", "limit_params", "joint_loss"]
+OF_MODEL = [*OF_SCENE, "contact_params", "limit_params", "joint_loss", "row_params"]
 UNSUPPORTED = {"drag": "a fluid", "gravcomp": "gravity compensation", "muscle": "tendons"}
 
 
@@ -76,6 +76,7 @@ class _Robot:
         self._read_bodies()
         self._read_actuators()
         self._read_contacts()
+        self._read_rows()
         dofs, rough = np.arange(m.nv) >= self.first, np.zeros(m.ngeom, bool)
         rough[self.friction_geoms[self.has_friction]] = True
         self.free: dict[str, Mask] = dict.fromkeys(("mass", "com", "inertia"), moving)
@@ -118,19 +119,41 @@ class _Robot:
         self.damping_of_kv = torch.tensor(gear**2 * (servos(m) & ~self.tied[1]))
 
     def _read_contacts(self) -> None:
-        """Read the contacts in the kernels' order."""
+        """Read the contacts with the ground, then those between bodies, in the kernels' order."""
         m, spheres = self.m, self.scene.spheres
         geoms = spheres.geom[np.argsort(spheres.link, kind="stable")].tolist() if self.hard else []
         ground = ground_pairs(m)[0][0] if geoms else 0
-        pairs, has_friction = np.zeros((len(geoms), 2), int), np.zeros(len(geoms), bool)
-        for k, geom in enumerate(geoms):
-            declared = tuple(sorted((ground, geom))) in declared_pairs(m)  # with a friction of its own
-            has_friction[k] = not declared and pair_law(m, ground, geom).condim > 1
-            ahead = int(np.sign(m.geom_priority[geom] - m.geom_priority[ground]))
-            pairs[k] = (ground if ahead <= 0 else geom), (geom if ahead >= 0 else ground)
+        touching = [*((ground, geom) for geom in geoms), *self.scene.geom_pairs]
+        pairs, has_friction = np.zeros((len(touching), 2), int), np.zeros(len(touching), bool)
+        for k, (a, b) in enumerate(touching):
+            declared = tuple(sorted((a, b))) in declared_pairs(m)  # with a friction of its own
+            has_friction[k] = not declared and pair_law(m, a, b).condim > 1
+            ahead = int(np.sign(m.geom_priority[b] - m.geom_priority[a]))
+            pairs[k] = (a if ahead <= 0 else b), (b if ahead >= 0 else a)
         # The geoms whose larger friction a contact has
         self.friction_geoms, self.has_friction = torch.tensor(pairs), torch.tensor(has_friction)
         self.contact_body = torch.tensor(m.geom_bodyid[geoms]).long()
+
+    def _read_rows(self) -> None:
+        """Read which inverse weights the blocks of rows between bodies add up, in the kernels' order.
+
+        They are those of degrees of freedom, then of the bodies' translations and of their rotations.
+        """
+        m, of_blocks = self.m, list[NDArray[Any]]()
+        for k in np.flatnonzero(m.eq_active0).tolist():
+            ends = np.array([m.eq_obj1id[k], m.eq_obj2id[k]])
+            if m.eq_type[k] == mujoco.mjtEq.mjEQ_JOINT:
+                of_blocks.append(m.jnt_dofadr[ends[ends >= 0]])
+                continue
+            bodies = m.site_bodyid[ends] if m.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE else ends
+            of_blocks.append(m.nv + bodies)
+            if m.eq_type[k] == mujoco.mjtEq.mjEQ_WELD:
+                of_blocks.append(m.nv + m.nbody + bodies)
+        self.equalities = len(of_blocks)
+        of_blocks += [m.nv + m.geom_bodyid[[a, b]] for a, b in self.scene.geom_pairs]
+        self.sums = torch.zeros(len(of_blocks), m.nv + 2 * m.nbody).double()
+        for row, weights in zip(self.sums, of_blocks, strict=True):
+            row[weights] = 1.0
 
     def _about(self, turn: Tensor, place: Tensor, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return the bodies' centres of mass and moments of inertia in frames where they have these poses."""
@@ -145,26 +168,36 @@ class _Robot:
         at, inertia = self._about(self.turn, self.place, values)
         ten = torch.cat((mass, mass * at, inertia[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]), 1)
         links = ten.new_zeros(nlink, columns.LINK).index_add(0, self.link, ten)
-        weight, contacts = self._logs_of_weights(values) if self.hard else (0 * values["armature"], links[:0, :2])
+        none = 0 * values["armature"], links[:0, :2]
+        weight, constraints = self._constraints(values) if self.hard else none
         of_dofs = torch.stack((values["armature"], values["damping"], values["frictionloss"], weight))[:, self.first :]
         servo = torch.stack(
             (self.stiffness_of_gain * drive, self.damping_of_gain * drive + self.damping_of_kv * values["kv"])
         )
         of_servos = ten.new_zeros(2, nlink).index_add(1, self.motor_link, servo)[:, 1:]
         joints = torch.nn.functional.pad(torch.cat((of_dofs, of_servos)), (1, 0)).mT
-        return torch.cat([x.flatten() for x in (links, joints, self.gear * drive[:, None], contacts)])
+        return torch.cat([x.flatten() for x in (links, joints, self.gear * drive[:, None], constraints)])
 
-    def _logs_of_weights(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the logarithms of MuJoCo's inverse weights of degrees of freedom, and the contacts' columns."""
+    def _constraints(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the logarithms of MuJoCo's inverse weights of degrees of freedom, and the columns of contacts with the
+        ground and of rows between bodies."""
         mass, (turning, moving) = values["mass"][self.bodies, None, None], self.jacobian.unbind(1)
         at, inertia = self._about(self.world, torch.zeros_like(self.place), values)
         moving = moving + torch.linalg.cross(turning, at[:, :, None].expand_as(turning), dim=1)  # of centres of mass
         inertia = inertia - mass * (at.square().sum(1)[:, None, None] * torch.eye(3) - at[:, :, None] * at[:, None, :])
         matrix = (turning.mT @ inertia @ turning + mass * (moving.mT @ moving)).sum(0) + values["armature"].diag()
         inverse = torch.linalg.inv(matrix)
-        of_bodies = torch.ones(self.m.nbody).to(at).index_put((self.bodies,), (moving @ inverse * moving).sum((1, 2)))
-        friction = values["friction"][self.friction_geoms].amax(1).clamp(min=LEAST_FRICTION) * self.has_friction
-        return (self.mean @ inverse.diagonal()).log(), torch.stack((friction, of_bodies[self.contact_body].log()), 1)
+        of_dofs, fixed = self.mean @ inverse.diagonal(), torch.zeros(self.m.nbody).to(at)
+        of_bodies = [
+            fixed.index_put((self.bodies,), (jacobian @ inverse * jacobian).sum((1, 2)) / 3)
+            for jacobian in (moving, turning)
+        ]
+        of_rows = self.sums @ torch.cat((of_dofs, *of_bodies))
+        weights = torch.cat((of_bodies[0][self.contact_body], of_rows)).clamp(min=LEAST_WEIGHT)
+        rough = values["friction"][self.friction_geoms].amax(1).clamp(min=LEAST_FRICTION) * self.has_friction
+        ground, between = rough.split((len(self.contact_body), len(self.scene.geom_pairs)))
+        friction = torch.cat((ground, ground.new_zeros(self.equalities), between))
+        return of_dofs.log(), torch.stack((friction, weights.log()), 1)
 
     def model(self, values: dict[str, Tensor]) -> mujoco.MjModel:
         """Return a copy of the file's model with these parameters."""
@@ -211,7 +244,7 @@ class ParametricSimulator(Simulator):
     """A Simulator whose steps are differentiable in the robot's constants, which are the same in all environments.
 
     Args:
-        scene: without fluid, gravity compensation, tendons and constraints between bodies.
+        scene: without fluid, gravity compensation and tendons.
         num_envs: as for Simulator, like the rest.
         integration: contact model and substeps.
         *args: control_dt and horizon.
@@ -231,8 +264,6 @@ class ParametricSimulator(Simulator):
         self._robot = _Robot(scene, hard=integration.contact == "mujoco")
         scene = dataclasses.replace(scene, parameters=self._robot.count)
         super().__init__(scene, num_envs, integration, *args, division=(1, 1), **options)
-        if self._launcher.spec.pairs:
-            raise SceneError(f"{scene.name}: parameters are not supported with constraints between bodies")
         self.parameters = {}
 
     @property
@@ -266,7 +297,7 @@ class ParametricSimulator(Simulator):
             )
         model = model_of(scene, divide(scene, 1, 1), launcher.spec.dtype, str(self.device))
         for name in OF_MODEL:
-            if (array := getattr(launcher._model, name)) is not None:
+            if (array := getattr(launcher._model, name, None)) is not None:
                 wp.to_torch(array).copy_(wp.to_torch(getattr(model, name)))
         self._versions = [version + 1 for version in self._versions]  # earlier steps have no adjoint any more
         row = self._robot.columns(self._robot.file | given).to(self.device, self.dtype)

@@ -29,7 +29,7 @@ from diffsim.kernels.lane import D_LIMIT, K_LIMIT, MOTOR, lane_of
 from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
-from diffsim.kernels.pairs import pair_rows
+from diffsim.kernels.pair_adjoint import pair_adjoint
 from diffsim.kernels.parameters import parameter_adjoint
 from diffsim.kernels.solve import factor_solve
 from diffsim.kernels.spatial import spatial
@@ -48,7 +48,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint, parameters = muscle_law(spec), constraint_law(spec), parameter_adjoint(spec)
-    PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_rows(spec) if spec.pairs else None
+    PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_adjoint(spec) if spec.pairs else None
     CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
     CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT, BASE_DAMPED = spec.has("contact motor clamp muscle limit base_damping")
     LIMIT = LIMIT and not spec.constrained  # the penalty law
@@ -445,7 +445,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(LEARNED):
                 parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_factors)
             if wp.static(PAIRS):
-                pairs.add_adjoint(m, here, links, contacts, nodes, adj)
+                pairs.add_adjoint(m, here, links, contacts, nodes, adj, adj_factors)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):

@@ -46,7 +46,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     cone = pyramidal_cone(spec) if PYRAMID else elliptic_cone(spec)
     in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
-    LEARNED, COLUMNS = spec.parameters > 0, spec.parameters - 2 * spec.spheres  # see parameters.py
+    LEARNED, COLUMNS = spec.parameters > 0, spec.parameters - 2 * (spec.spheres + spec.pairs)  # see parameters.py
 
     @wp.func
     def impedance_row(c: Params, stiffness: T, r: T):

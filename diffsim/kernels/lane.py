@@ -19,7 +19,7 @@ K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))
 def lane_of(spec: KernelSpec) -> wp.Function:
     t = types(spec)
     T, Model, Lane, read = t.T, t.Model, t.Lane, blocks(spec).read
-    CONTACT, VARIED, CONSTRAINED = "contact" in spec.features, spec.varied, spec.constrained
+    CONTACT, VARIED, CONSTRAINED = "contact" in spec.features or spec.pairs > 0, spec.varied, spec.constrained
     THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.slots
 
     @wp.func

@@ -23,7 +23,8 @@ from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
 # Columns: of each link mass, first moments (3) and moments of inertia xx, yy, zz, xy, xz, yz; of each joint, in its
-# link's row, those named below; of each motor gear and bias; of each contact friction and the logarithm of its weight.
+# link's row, those named below; of each motor gear and bias; of each contact with the ground, and then of each block of
+# rows between bodies (pairs.py), friction and the logarithm of its weight.
 LINK, JOINT, MOTOR, CONTACT = 10, 6, 2, 2
 ARMATURE, DAMPING, LOSS, WEIGHT, STIFFNESS, SERVO_DAMPING = range(JOINT)
 

@@ -17,6 +17,7 @@ MADE = "gradients", "joystick", "numerics", "overview", "suites", "tracking", "t
 CASES = [
     *((name, {}) for name in MADE),
     *((name, {"race": True}) for name in ("joystick", "tracking")),
+    ("pairs", {"parts": ("solver",)}),
     ("speed", {"parts": ("iteration",), "output": common.RESULTS / "h100"}),
 ]
 
