@@ -34,7 +34,6 @@ class Dribble(Go2):
     name, asset, symmetric = "dribble", "go2.xml", False
     num_random = Go2.num_random + 13
     actor_dim, obs_dim, obs_parts = BALL + (Go2.actor_dim or 0), BALL + Go2.obs_dim, ()
-    ranges = {}  # noqa: RUF012
 
     @classmethod
     def load_robot(cls) -> Scene:
