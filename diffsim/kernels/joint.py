@@ -29,7 +29,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     T, Model, Lane = t.T, t.Model, t.Lane
     vec2, block = t.vec2, blocks(spec)
     pick = block.pick
-    STIFFNESS, DAMPING, LIMIT, CLAMP = spec.has("stiffness damping limit clamp")
+    STIFFNESS, DAMPING, LIMIT, CLAMP, TENDON = spec.has("stiffness damping limit clamp tendon")
     LIMIT = LIMIT and not spec.constrained
     VARIED, NU, EXPLICIT_SERVOS = spec.varied, spec.nu, "explicit_servos" in spec.features
 
@@ -46,7 +46,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
 
         return motors_forward
 
-    motors_forward, motors_backward = motors(t.Motions), motors(t.Nodes) if CLAMP else None
+    motors_forward, motors_backward = motors(t.Motions), motors(t.Nodes) if CLAMP or TENDON else None
 
     @wp.func
     def unclamped_force(m: Model, i: int, motor: T, q: T, qd: T):

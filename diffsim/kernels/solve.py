@@ -118,7 +118,7 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
     Links, Motions, Loads = t.Links, t.Motions, t.Loads
     FLOATING, IMPLICIT, CONSTRAINED = spec.floating, spec.implicit, spec.constrained
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
-    BASE_DAMPED, CLAMP = spec.has("base_damping clamp")
+    BASE_DAMPED, CLAMP, TENDON_DAMPING = spec.has("base_damping clamp tendon_damping")
     PAIRS = spec.pairs > 0
 
     @wp.func
@@ -130,9 +130,13 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(IMPLICIT):
             resistance = joint.resistance(m, here, k, link.q, link.qd, unclamped)
             d = d + here.h * resistance[1]
+            if wp.static(TENDON_DAMPING):
+                d = d + here.h * motion.tendon_damping
         if wp.static(CONSTRAINED):
             if phase == SOLVE:
                 damper = here.h * joint.end_damping(m, k, unclamped)
+                if wp.static(TENDON_DAMPING):
+                    damper = damper + here.h * motion.tendon_damping
                 d = d + damper
                 f = -damper * motion.accel_joint
             else:
@@ -237,7 +241,7 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
     T, vec6, load, link_of, join = t.T, t.vec6, kin.load, kin.link_of, spatial(spec).join
     Model, Lane, Ck, Links, Nodes, Base = t.Model, t.Lane, t.Checkpoint, t.Links, t.Nodes, t.Base
     FLOATING, SLOTS, SOLVES, DAMPED = spec.floating, spec.slots, spec.solves, spec.damped
-    BASE_DAMPED, CLAMP = spec.has("base_damping clamp")
+    BASE_DAMPED, CLAMP, TENDON_DAMPING = spec.has("base_damping clamp tendon_damping")
     THREADS_PER_ENV, SHARERS, TRUNK = spec.threads_per_env, spec.sharers, spec.trunk
 
     @wp.func
@@ -302,6 +306,8 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
                     nodes[i].g = (
                         nodes[i].gqd + damping_pass * joint.end_damping(m, here.at + i, unclamped) * nodes[i].lam
                     )
+                    if wp.static(TENDON_DAMPING):
+                        nodes[i].g = nodes[i].g + damping_pass * nodes[i].tendon_damping * nodes[i].lam
             solve(m, here, ck, SOLVES * here.row + s, links, nodes, g_base)
             damping_pass = T(1.0)
 

@@ -78,8 +78,8 @@ class KernelSpec:
     @property
     def damped(self) -> bool:
         """Tell whether damping follows the constraints."""
-        damping, base_damping, explicit = self.has("damping base_damping explicit_damping")
-        return self.constrained and (damping or base_damping) and not explicit
+        *dampers, explicit = self.has("damping base_damping tendon_damping explicit_damping")
+        return self.constrained and any(dampers) and not explicit
 
     @property
     def nfactor(self) -> int:

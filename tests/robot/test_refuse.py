@@ -48,6 +48,13 @@ ROCK = (
 )
 HILLS = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
 FIXED = '<tendon><fixed name="string"><joint joint="hinge" coef="1"/></fixed></tendon>'
+CHAIN = """
+<mujoco> <option integrator="Euler"/>
+  <worldbody> <body> <joint name="a"/> <geom size="1"/> <body> <joint axis="1 0 0"/> <geom size="1"/>
+    <body> <joint name="b"/> <geom size="1"/> </body> </body> </body> </worldbody>
+  <tendon> <fixed name="t"> <joint joint="b" coef="1"/> <joint joint="a" coef="1"/> </fixed> </tendon>
+  <actuator> <velocity name="m" tendon="t"/> </actuator>
+</mujoco>"""
 RAG = '<flex name="rag" dim="1" body="arm arm" vertex="0 0 0 1 0 0" element="0 1"/>'
 REFUSED = {  # what the variants of test_variants.py have not
     # joints
@@ -61,7 +68,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "joint 'j': actuatorgravcomp within actuatorfrcrange is not simulated": robot(
         f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BALL}</body>'
     ),
-    "joint 'weak': actuatorfrcrange together with muscles is not simulated": tendon(
+    "joint 'weak': actuatorfrcrange together with muscles or actuators at sites is not simulated": tendon(
         joint='<joint name="weak" actuatorfrcrange="-1 1"/>', actuator=MUSCLES
     ),
     "joint 'a', 'b': they have a motion without inertia": [
@@ -111,6 +118,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "actuator 'm': stiffness and damping of a servo must not be negative": [
         actuator("position", 'kp="-5"'),
         actuator("velocity", 'kv="-2"'),
+        pendulum(rest=f'{FIXED}<actuator><position name="m" tendon="string" kp="-5"/></actuator>'),
     ],
     "actuator 'm': only motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on": [
         free("", '<actuator><motor name="m" joint="r"/></actuator>'),
@@ -127,10 +135,9 @@ REFUSED = {  # what the variants of test_variants.py have not
     ),
     # tendons and muscles
     "tendon 'string': a second number of damping is not simulated": tendon(spring='damping="0 3"'),
-    "tendon 'string': only spatial tendons through sites, without pulleys or wrapping geoms": [
+    "tendon 'string': only fixed tendons, or spatial ones through sites, without pulleys or wrapping geoms": [
         tendon('<geom geom="g"/>', actuator=MUSCLES),
         tendon('<pulley divisor="2"/><site site="w"/><site site="a"/>', actuator=MUSCLES),
-        pendulum(rest=f'{FIXED}<actuator><motor tendon="string" gear="-1"/></actuator>'),
     ],
     "site 'w': a muscle of a floating robot cannot hold on to the world": tendon(
         joint="<freejoint/>", actuator=MUSCLES
@@ -144,6 +151,23 @@ REFUSED = {  # what the variants of test_variants.py have not
     "actuator 'biceps': its force follows from what it moves, and it moves nothing; give force": tendon(
         actuator=MUSCLES.replace('force="5"', 'force="-5"')
     ),
+    "actuator 'm': only motors, position and velocity servos on a fixed tendon": [
+        pendulum(rest=f"{FIXED}<actuator><{kind}/></actuator>")
+        for kind in (
+            'muscle name="m" tendon="string" lengthrange="1 2"',
+            'general name="m" tendon="string" dyntype="filter"',
+        )
+    ],
+    "actuator 'm': damping of a tendon whose joints move each other is simulated with the integrator Euler only": [
+        CHAIN.replace("Euler", integrator) for integrator in ("implicitfast", "implicit")
+    ],
+    "actuator 'm': forcerange is simulated of a joint's only actuator": pendulum(
+        rest=f'{FIXED}<actuator><motor tendon="string"/><motor name="m" joint="hinge" forcerange="-1 1"/></actuator>'
+    ),
+    "actuator 'm': only motors at a site, without refsite and forcerange": [
+        pendulum(inside='<site name="s"/><site name="r"/>', rest=f'<actuator><{kind} name="m" site="s"/></actuator>')
+        for kind in ("velocity", 'motor refsite="r"', 'motor forcerange="-1 1"', 'general dyntype="filter"')
+    ],
     # the file
     "numeric k_n: must be one number, not negative": [
         pendulum(rest=f'<custom><numeric name="k_n" data="{data}"/></custom>') for data in ("-1", "1 2")
