@@ -138,8 +138,8 @@ BOUNDED_SERVOS = SERVOS.format(
     more='<position joint="b" kp="9" kv="2"/>',
 )
 
-# Two fingers and a joint beyond the first, on tendons with bounded forces: one between fingers that do not move each
-# other, whose servo is damped, and one along the chain.
+# Two fingers and a joint beyond the first, on tendons with damped servos: one between fingers that do not move each
+# other, with a bounded force, and one along the chain.
 GRIPPER = """
 <mujoco>
   <compiler angle="radian"/> <option integrator="{integrator}"/> <default> <joint armature="0.1"/> </default>
@@ -165,7 +165,7 @@ GRIPPER = """
   <actuator>
     <general tendon="split" gear="1.5" ctrlrange="-1 2" gainprm="6" biastype="affine" biasprm="1 -6 -0.4"
       forcerange="-5 6"/>
-    <position tendon="chain" kp="9"/> <motor tendon="chain" gear="-2"/> <position joint="b" kp="3" kv="0.2"/>
+    <position tendon="chain" kp="9" kv="0.5"/> <motor tendon="chain" gear="-2"/> <position joint="b" kp="3" kv="0.2"/>
     <motor joint="c"/>
   </actuator>
   <keyframe> <key qpos="0 0.3 0 0.2"/> </keyframe>
@@ -174,7 +174,7 @@ GRIPPER = """
 # It has thrusters on its body and on its arm, beside a tendon of the arm and a motor.
 DRONE = """
 <mujoco>
-  <compiler angle="radian"/> <option cone="elliptic"/>
+  <compiler angle="radian"/> <option cone="elliptic" integrator="implicitfast"/>
   <custom>
     <numeric name="k_n" data="2e4"/> <numeric name="k_d" data="2e4"/> <numeric name="k_t" data="50"/>
     <numeric name="mu" data="0.5"/>
@@ -198,7 +198,7 @@ DRONE = """
   <tendon> <fixed name="both"> <joint joint="a" coef="1"/> <joint joint="b" coef="2"/> </fixed> </tendon>
   <actuator>
     <motor site="nozzle" gear="1 2 9 4 -5 6" ctrlrange="0 4"/> <motor site="tip" gear="-1 2 1 4 -5 6"/>
-    <position tendon="both" kp="3"/> <motor joint="b"/>
+    <position tendon="both" kp="3" kv="0.5"/> <motor joint="b"/>
   </actuator>
 </mujoco>"""
 

@@ -45,8 +45,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     T, vec2, vec3, vec6, quat, Model, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Lane
     Link, Node, Adjoint, Base, Contact = t.Link, t.Node, t.Adjoint, t.Base, t.Contact
     Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.Ts
-    lane, solve = lane_of(spec), factor_solve(spec)
-    join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
+    lane, join, load, link_of, qpos_adr = lane_of(spec), sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint, parameters = muscle_law(spec), constraint_law(spec), parameter_adjoint(spec)
     PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_rows(spec) if spec.pairs else None
@@ -55,6 +54,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     LIMIT = LIMIT and not spec.constrained  # the penalty law
     TENDON, SITE = spec.has("tendon site")
     transmission = transmission_law(spec) if TENDON or SITE else None
+    solve = factor_solve(spec, transmission)
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     read, write, pick = block.read, block.write, block.pick

@@ -42,7 +42,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, sweep, constraint, newton = muscle_law(spec), articulated(spec), constraint_law(spec), newton_method(spec)
     PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_rows(spec) if spec.pairs else None
-    CONTACT, MOTOR, MUSCLE, TENDON, SITE = spec.has("contact motor muscle tendon site")
+    CONTACT, MOTOR, MUSCLE, TENDON, SITE, CHAIN = spec.has("contact motor muscle tendon site tendon_chain")
     transmission = transmission_law(spec) if TENDON or SITE else None
     NU, FLOATING, FORCED = spec.nu, spec.floating, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
@@ -320,6 +320,9 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                                 m, here, links, free_loads, motions, contacts, root, status
                             )
                         else:
+                            if wp.static(CHAIN):
+                                if phase == SOLVE:
+                                    root = transmission.correct_change(m, here, links, motions, root)
                             phase = phase + 1
                             if wp.static(not DAMPED):
                                 phase = DONE

@@ -270,18 +270,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     def correct_lambda(m: Model, here: Lane, links: Links, ck: Ck, contacts: Contacts, nodes: Nodes):
         """Turn the tree's lambda, and the twists under it, into those with the rows between bodies."""
         if here.end > here.begin:
-            row = SOLVES * here.row + SOLVES - 1
-            for i in range(1, here.n):
-                for r in range(6):
-                    nodes[i].U[r] = kin.load(ck.f, row, 7 * (i - 1) + r, here.e)
-                nodes[i].dinv = kin.load(ck.f, row, 7 * (i - 1) + 6, here.e)
-            L = mat6()
-            if wp.static(FLOATING):
-                k = int(BASE)
-                for r in range(6):
-                    for c in range(r + 1):
-                        L[r, c] = kin.load(ck.f, row, k, here.e)
-                        k = k + 1
+            L = backward.recall_factor(here, ck, SOLVES * here.row + SOLVES - 1, nodes)
             for c in range(here.begin, here.end):
                 contacts[c].rate = lambda_rates(m, c, contacts, nodes)
             backward.solve(m, here, links, contacts, nodes, L, T(1.0), T(ENOUGH))

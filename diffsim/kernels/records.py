@@ -34,6 +34,7 @@ TRANSMISSION_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
         ("tendon_begin", "ints", "begin"),  # of each tendon, in the next two
         ("tendon_slot", "ints", "link"),
         ("tendon_coef", "reals", "coef"),
+        ("tendon_chain", "ints", "chain"),
         ("site_actuator", "ints", "site"),
         ("site_slot", "ints", "site_link"),
         ("site_torque", "vec3s", "torque"),  # in the link's frame, about its origin, per force of the actuator
@@ -82,7 +83,7 @@ def add_constraints(
     }
     if "tendon_damping" in spec.features:
         for name in ("Motion", "Node"):
-            structs[name] |= {"tendon_damping": T}  # of the joint, implicit, by tendons
+            structs[name] |= {"tendon_damping": T}  # of the joint, implicit, by tendons; the base's of a whole chain
     if spec.framed or spec.pairs:
         structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
     if spec.constrained:
@@ -122,14 +123,15 @@ def add_constraints(
             "rate": vec3,  # acceleration of the rows by the direction
             "change": vec3,  # of the forces, by the step
         }
+        structs["Lane"] |= {
+            "begin": int,  # the first block's element of contacts
+            "end": int,  # the element after the last block that acts in the substep
+        }
+    if spec.branched:
         work = {
             "twist": vec6,  # of the link, by the forces of rows between bodies; in the inward sweep the bias force
             "rate": T,  # of its joint
         }
         structs["Motion"] |= work
         structs["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
-        structs["Lane"] |= {
-            "begin": int,  # the first block's element of contacts
-            "end": int,  # the element after the last block that acts in the substep
-        }
         structs["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia

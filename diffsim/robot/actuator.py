@@ -25,15 +25,20 @@ class Transmissions(NamedTuple):
     begin: Index  # (nt + 1,) of each tendon in the two that follow
     link: Index  # (nj,) its joints' links
     coef: Array  # (nj,) the tendon's change of length by each joint's position, times the actuator's gear
+    chain: Index  # (1,) the tendon with damping along a chain of joints, -1 if none
     site: Index  # (ns,) actuators at sites
     site_link: Index  # (ns,) the links that they push
     torque: Array  # (ns, 3) m, per force of the actuator, about the link's origin and in the link's frame
     force: Array  # (ns, 3) the same of the force
 
-    def features(self, explicit: bool) -> frozenset[str]:
-        """Return the features of these actuators; explicit tells whether tendons' damping is."""
-        damped = bool(self.law[:, 1].any()) and not explicit
-        present = {"tendon": len(self.tendon), "site": len(self.site), "tendon_damping": damped}
+    def features(self, constrained: bool, explicit: bool) -> frozenset[str]:
+        """Return the features of these actuators with MuJoCo's constraints or not, whose damping may be explicit."""
+        present = {
+            "tendon": len(self.tendon),
+            "site": len(self.site),
+            "tendon_damping": bool(self.law[:, 1].any()) and not explicit,
+            "tendon_chain": self.chain[0] >= 0 and constrained and not explicit,
+        }
         return frozenset(name for name, used in present.items() if used)
 
 
@@ -135,9 +140,10 @@ def transmissions_of(m: mujoco.MjModel, nlink: int, bodies: list[Body]) -> Trans
             forces.append(force)
     if not len(tendons) + len(sites):
         return None
-    begins, link, site, site_link = (np.array(each, np.int32) for each in (begin, links, sites, pushed))
+    along = [*np.flatnonzero(_chained(m)[0][tendons]).tolist(), -1][:1]
+    begins, link, chain, site, site_link = (np.array(x, np.int32) for x in (begin, links, along, sites, pushed))
     wrenches = (np.array(each).reshape(-1, 3) for each in (torques, forces))
-    return Transmissions(tendons, law, begins, link, np.array(coefs), site, site_link, *wrenches)
+    return Transmissions(tendons, law, begins, link, np.array(coefs), chain, site, site_link, *wrenches)
 
 
 def refused(m: mujoco.MjModel) -> Iterator[tuple[Mask, str]]:
@@ -146,16 +152,22 @@ def refused(m: mujoco.MjModel) -> Iterator[tuple[Mask, str]]:
     fixed = motors(m) & (m.actuator_trnid[:, 1] < 0) & ~bounded
     yield at_site(m) & ~fixed, "only motors at a site, without refsite and forcerange"
     yield on_tendon(m) & ~motors(m) & ~servos(m), "only motors, position and velocity servos on a fixed tendon"
-    yield _coupled(m), "damping of a tendon whose joints move each other is simulated with the integrator Euler only"
+    chained, branched = _chained(m)
+    several = branched | chained & (chained.sum() > 1)
+    why = "damping of tendons is simulated along one chain of joints, or with the integrator Euler"
+    yield several & (not takes_euler(m)), why
 
 
-def _coupled(m: mujoco.MjModel) -> Mask:
-    """Mark actuators whose implicit damping has an entry for two joints, which the kernels' matrix does not have."""
-    found = np.zeros(len(m.actuator_trntype), bool)
+def _chained(m: mujoco.MjModel) -> tuple[Mask, Mask]:
+    """Mark actuators with damping on a fixed tendon whose joints move each other: all in one chain, or some."""
+    chained, branched = np.zeros((2, len(m.actuator_trntype)), bool)
     for a in np.flatnonzero(on_tendon(m) & servos(m) & (m.actuator_biasprm[:, 2] != 0)).tolist():
         dofs = set(m.jnt_dofadr[joints_of(m, a)[0]].tolist())
+        moved = 0  # pairs of joints of which one moves the other
         for above in m.dof_parentid[list(dofs)].tolist():
-            while above >= 0 and above not in dofs:
+            while above >= 0:
+                moved += above in dofs
                 above = m.dof_parentid[above]
-            found[a] |= above >= 0
-    return found & (not takes_euler(m))
+        chained[a] = 0 < moved == len(dofs) * (len(dofs) - 1) // 2
+        branched[a] = moved > 0 and not chained[a]
+    return chained, branched

@@ -210,7 +210,7 @@ class Scene:
             "drag": self.density > 0 or self.viscosity > 0,
         }
         rows = self.pairs.features if self.pairs else frozenset[str]()
-        rows |= self.transmissions.features(explicit=euler) if self.transmissions else rows
+        rows |= self.transmissions.features(law is not None, explicit=euler) if self.transmissions else rows
         return frozenset(name for name, used in present.items() if used) | rows
 
     @property

@@ -51,10 +51,15 @@ FIXED = '<tendon><fixed name="string"><joint joint="hinge" coef="1"/></fixed></t
 CHAIN = """
 <mujoco> <option integrator="Euler"/>
   <worldbody> <body> <joint name="a"/> <geom size="1"/> <body> <joint axis="1 0 0"/> <geom size="1"/>
-    <body> <joint name="b"/> <geom size="1"/> </body> </body> </body> </worldbody>
-  <tendon> <fixed name="t"> <joint joint="b" coef="1"/> <joint joint="a" coef="1"/> </fixed> </tendon>
-  <actuator> <velocity name="m" tendon="t"/> </actuator>
+    <body> <joint name="b"/> <geom size="1"/> </body> </body> <body> <joint name="c"/> <geom size="1"/> </body> </body>
+  </worldbody>
+  <tendon>
+    <fixed name="t"> <joint joint="b" coef="1"/> <joint joint="a" coef="1"/> </fixed>
+    <fixed name="all"> <joint joint="b" coef="1"/> <joint joint="a" coef="1"/> <joint joint="c" coef="1"/> </fixed>
+  </tendon>
+  <actuator> <velocity name="m" tendon="t"/> {} </actuator>
 </mujoco>"""
+CHAINS = '<position tendon="t" kv="1"/>', '<velocity tendon="all"/>'
 RAG = '<flex name="rag" dim="1" body="arm arm" vertex="0 0 0 1 0 0" element="0 1"/>'
 REFUSED = {  # what the variants of test_variants.py have not
     # joints
@@ -158,8 +163,10 @@ REFUSED = {  # what the variants of test_variants.py have not
             'general name="m" tendon="string" dyntype="filter"',
         )
     ],
-    "actuator 'm': damping of a tendon whose joints move each other is simulated with the integrator Euler only": [
-        CHAIN.replace("Euler", integrator) for integrator in ("implicitfast", "implicit")
+    "damping of tendons is simulated along one chain of joints, or with the integrator Euler": [
+        CHAIN.replace("Euler", integrator).format(more)
+        for integrator in ("implicitfast", "implicit")
+        for more in CHAINS
     ],
     "actuator 'm': forcerange is simulated of a joint's only actuator": pendulum(
         rest=f'{FIXED}<actuator><motor tendon="string"/><motor name="m" joint="hinge" forcerange="-1 1"/></actuator>'
@@ -275,3 +282,10 @@ def test_what_has_no_effect_is_no_obstacle():
         )
     )
     assert scene.features == {"hinge", "contact"}
+
+
+def test_damping_along_one_chain_is_simulated():
+    """With an integrator that damps implicitly; Euler damps any number explicitly."""
+    assert parse(CHAIN.replace("Euler", "implicitfast").format("")).transmissions.chain == [0]
+    for more in CHAINS:
+        parse(CHAIN.format(more))
