@@ -25,11 +25,16 @@ def clamp_law(spec: KernelSpec) -> SimpleNamespace:
         return motor + T(m.servo_stiffness[i]) * (T(m.servo_ref[i]) - q) - T(m.servo_damping[i]) * qd
 
     @wp.func
+    def clamped(force: T, low: T, high: T):
+        """Return the force within its bounds. A NaN stays one, unlike with min and max, so that it is contained."""
+        return pick(high, force, high, pick(force, low, low, force))
+
+    @wp.func
     def actuator_force(m: Model, i: int, motor: T, q: T, qd: T):
         """Return the force of the joint's actuators."""
         force = motor
         if wp.static(CLAMP):
-            force = wp.max(wp.min(unclamped_force(m, i, motor, q, qd), T(m.force_high[i])), T(m.force_low[i]))
+            force = clamped(unclamped_force(m, i, motor, q, qd), T(m.force_low[i]), T(m.force_high[i]))
         return force
 
     @wp.func

@@ -20,6 +20,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.clamp import clamp_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.muscle import muscle_law
@@ -32,7 +33,7 @@ from diffsim.kernels.wide import blocks
 def transmission_law(spec: KernelSpec) -> SimpleNamespace:
     t, block, joint = types(spec), blocks(spec), joint_law(spec)
     T, vec3, Model, Lane, Links, Nodes, pick = t.T, t.vec3, t.Model, t.Lane, t.Links, t.Nodes, block.pick
-    wrench_to_world = muscle_law(spec).wrench_to_world
+    wrench_to_world, clamped = muscle_law(spec).wrench_to_world, clamp_law(spec).clamped
     VARIED, NU, FLOATING = spec.varied, spec.nu, spec.floating
     TENDON, DAMPED, CHAIN = spec.has("tendon tendon_damping tendon_chain")
     forward, backward = (row_solver(spec, rows) if CHAIN else None for rows in ("Motions", "Nodes"))
@@ -57,8 +58,7 @@ def transmission_law(spec: KernelSpec) -> SimpleNamespace:
             own = links[m.tendon_slot[entry]]
             force = force - T(m.tendon_coef[entry]) * (T(law[0]) * own.q + T(law[1]) * own.qd)
         unclamped = pick(low, force, pick(force, high, T(1.0), T(0.0)), T(0.0))
-        # Not min and max, which make a bound of a NaN, so that the environment would not be contained.
-        return pick(high, force, high, pick(force, low, low, force)), unclamped
+        return clamped(force, low, high), unclamped
 
     def driver(rows: type, motors: wp.Function) -> wp.Function:
         @wp.func
