@@ -138,6 +138,70 @@ BOUNDED_SERVOS = SERVOS.format(
     more='<position joint="b" kp="9" kv="2"/>',
 )
 
+# Two fingers and a joint beyond the first, on tendons with damped servos: one between fingers that do not move each
+# other, with a bounded force, and one along the chain.
+GRIPPER = """
+<mujoco>
+  <compiler angle="radian"/> <option integrator="{integrator}"/> <default> <joint armature="0.1"/> </default>
+  <worldbody>
+    <body pos="0 0 1">
+      <joint type="slide" axis="0 0 1" damping="0.3"/> <inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>
+      <body pos="0.1 0 0">
+        <joint name="a" axis="0 1 0" actuatorfrcrange="-8 9"/>
+        <inertial pos="0.1 0 0.1" mass="1" diaginertia=".1 .2 .1"/>
+        <body pos="0.3 0 0">
+          <joint name="c" axis="0 1 0"/> <inertial pos="0.1 0.1 0" mass="0.5" diaginertia=".1 .2 .1"/>
+        </body>
+      </body>
+      <body pos="-0.1 0 0">
+        <joint name="b" axis="1 1 0"/> <inertial pos="0 0.1 0" mass="0.5" diaginertia=".1 .2 .1"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="split"> <joint joint="a" coef="0.7"/> <joint joint="b" coef="-1.3"/> </fixed>
+    <fixed name="chain"> <joint joint="a" coef="0.4"/> <joint joint="c" coef="0.8"/> </fixed>
+  </tendon>
+  <actuator>
+    <general tendon="split" gear="1.5" ctrlrange="-1 2" gainprm="6" biastype="affine" biasprm="1 -6 -0.4"
+      forcerange="-5 6"/>
+    <position tendon="chain" kp="9" kv="0.5"/> <motor tendon="chain" gear="-2"/> <position joint="b" kp="3" kv="0.2"/>
+    <motor joint="c"/>
+  </actuator>
+  <keyframe> <key qpos="0 0.3 0 0.2"/> </keyframe>
+</mujoco>"""
+
+# It has thrusters on its body and on its arm, beside a tendon of the arm and a motor.
+DRONE = """
+<mujoco>
+  <compiler angle="radian"/> <option cone="elliptic" integrator="implicitfast"/>
+  <custom>
+    <numeric name="k_n" data="2e4"/> <numeric name="k_d" data="2e4"/> <numeric name="k_t" data="50"/>
+    <numeric name="mu" data="0.5"/>
+  </custom>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body pos="0 0 1">
+      <freejoint/> <geom size="0.1" mass="2"/> <site name="nozzle" pos=".1 .2 .3" euler="0.3 0.7 -0.4"/>
+      <body pos=".2 0 0">
+        <joint name="a" axis="0 1 0" armature="0.1"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/>
+        <body quat="1 2 3 4">
+          <inertial pos=".1 0 0" mass="1" diaginertia=".1 .1 .1"/> <site name="tip" pos=".1 .2 .3" quat="4 3 2 1"/>
+        </body>
+        <body pos=".3 0 0">
+          <joint name="b" axis="1 0 0" armature="0.1"/> <geom size="0.05" mass="0.5"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon> <fixed name="both"> <joint joint="a" coef="1"/> <joint joint="b" coef="2"/> </fixed> </tendon>
+  <actuator>
+    <motor site="nozzle" gear="1 2 9 4 -5 6" ctrlrange="0 4"/> <motor site="tip" gear="-1 2 1 4 -5 6"/>
+    <position tendon="both" kp="3" kv="0.5"/> <motor joint="b"/>
+  </actuator>
+</mujoco>"""
+
 # Gravity is compensated for a part of each link, two of which are two bodies, and a free joint has inertia and damping.
 COMPENSATED = """
 <mujoco>

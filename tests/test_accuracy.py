@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import BALL, DISTINCT, HINGE, OSCILLATOR, acting_states, leg_scene, parse, run, task_scene, without
+from scenes import BALL, DISTINCT, DRONE, HINGE, OSCILLATOR, acting_states, leg_scene, parse, run, task_scene, without
 from warp._src.context import ModuleBuilder
 
 import diffsim
@@ -285,14 +285,16 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "terrain": r"\(var_m\)\.(terrain|carrier_along)\b|\bnearest_of_each",
     "varied": r"\bcontact_constants_adjoint|\blimit_constants_derivatives|\(var_m\).owned\b",
     "forced": r"\badd_forces|\(var_m\)\.body_com\b",
+    "tendon": r"\(var_m\)\.tendon_\w+\b",
+    "site": r"\(var_m\)\.site_\w+\b",
 }
 
 
-@pytest.mark.parametrize("name", [*DISTINCT, "cartpole", "go2", "bare", "leg", "hills", "varied", "forced"])
+@pytest.mark.parametrize("name", [*DISTINCT, "cartpole", "go2", "bare", "leg", "hills", "varied", "forced", "drone"])
 def test_kernels_hold_the_code_of_the_features_and_no_other(name):
     hopper, options = task_scene("hopper"), {name: True} if name in ("varied", "forced") else {}
     scenes = {"leg": leg_scene(grounded=True), "bare": without(hopper, "contact", "limit", "damping")}
-    scenes |= {"hills": hopper.with_terrain(incline(10.0)), "varied": hopper, "forced": hopper}
+    scenes |= {"hills": hopper.with_terrain(incline(10.0)), "varied": hopper, "forced": hopper, "drone": parse(DRONE)}
     scene = scenes[name] if name in scenes else task_scene(name)
     text = source(scene, **options)
     for feature, pattern in CODE.items():

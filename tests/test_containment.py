@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import BALL, acting_states, free_states, parse, task_scene
+from scenes import BALL, BOUNDED_SERVOS, acting_states, free_states, parse, task_scene
 
 import diffsim
 from diffsim.sim.integration import Integration
@@ -54,6 +54,17 @@ def test_simulator_contains_what_is_not_finite(name, integration, where, value, 
     assert sim.nonfinite_gradients.sum() == 0
     assert not step_and_gradients(sim, states := acting_states(scene, 5, rng))[0][0].isnan().any()
     assert not sim.nonfinite.any()
+
+
+def test_a_control_that_is_not_a_number_is_contained_where_forces_are_bounded(rng):
+    """min and max would make a bound of it."""
+    scene = parse(BOUNDED_SERVOS)
+    states = free_states(scene, 5, rng)
+    states[2][BAD] = np.nan
+    sim = Simulator(scene, 5, Integration("mujoco", 4))
+    outputs, gradients = step_and_gradients(sim, states)
+    np.testing.assert_array_equal(sim.nonfinite, [False, False, True, False, False])
+    assert all(x.isfinite().all() for x in (*outputs, *gradients)) and not gradients[2][BAD].any()
 
 
 BALLS = BALL.replace('mass="2"/>', 'mass="2"/> <body> <joint type="ball" stiffness="1"/> <geom size="0.1"/> </body>')

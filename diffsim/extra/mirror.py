@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffsim.robot.elements import at_rest
+from diffsim.robot.elements import at_rest, muscles
 from diffsim.robot.scene import Array
 from diffsim.tasks.locomotion import Locomotion
 
@@ -94,7 +94,8 @@ def reflections(
         sides: (right, left) beginnings or ends of names, which a mirror exchanges.
 
     Raises:
-        ValueError: a joint or an actuator has no partner of the other side's name, or its axis is another one.
+        ValueError: a joint or an actuator has no partner of the other side's name, or its axis is another one; or an
+            actuator is on a fixed tendon or at a site.
     """
     qpos, qvel, action = (list[tuple[int, float]]() for _ in range(3))  # from where, sign
     frames = at_rest(model).xmat.reshape(-1, 3, 3)
@@ -103,7 +104,9 @@ def reflections(
         qpos += enumerate(positions, int(model.jnt_qposadr[partner]))
         qvel += enumerate(rates, int(model.jnt_dofadr[partner]))
     for motor, partner in enumerate(partners([model.actuator(k).name for k in range(model.nu)], sides)):
-        pulls = model.actuator_trntype[motor] == mujoco.mjtTrn.mjTRN_TENDON
+        pulls = bool(muscles(model)[motor])
+        if not pulls and model.actuator_trntype[motor] != mujoco.mjtTrn.mjTRN_JOINT:
+            raise ValueError(f"actuator {model.actuator(motor).name!r} has no known mirror image: it is on no joint")
         action.append((partner, 1.0 if pulls else qvel[model.jnt_dofadr[model.actuator_trnid[motor, 0]]][1]))
     whole = [Reflection.of(numbers, device, dtype) for numbers in (qpos, qvel, action)]
     return *whole, *(Reflection(part.index[n:] - n, part.sign[n:]) for part, n in zip(whole, (7, 6), strict=False))

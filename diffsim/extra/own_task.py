@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffsim.robot.actuator import joints_of
 from diffsim.robot.elements import control_range, home_key, label, listed, servos
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Array, Scene
@@ -79,9 +80,10 @@ def start_control(m: mujoco.MjModel, start: Sequence[float] = ()) -> Array:
         return np.array(m.key_ctrl[key])
     qpos = np.array(start[: m.nq]) if len(start) else m.key_qpos[key] if key >= 0 else m.qpos0
     control, (gain, (constant, stiffness)) = np.zeros(m.nu), (m.actuator_gainprm[:, 0], m.actuator_biasprm[:, :2].T)
-    for a in np.flatnonzero(servos(m) & (gain != 0)).tolist():  # each on a hinge or a slide
-        angle = qpos[m.jnt_qposadr[m.actuator_trnid[a, 0]]]
-        control[a] = -(constant[a] + stiffness[a] * m.actuator_gear[a, 0] * angle) / gain[a]
+    for a in np.flatnonzero(servos(m) & (gain != 0)).tolist():  # each on a hinge, a slide or a fixed tendon
+        joints, coefs = joints_of(m, a)
+        length = coefs @ qpos[m.jnt_qposadr[joints]]
+        control[a] = -(constant[a] + stiffness[a] * m.actuator_gear[a, 0] * length) / gain[a]
     return control
 
 

@@ -51,7 +51,8 @@ FIELDS: dict[str, tuple[str, Any]] = {
 OF_SCENE = """mass com inertia armature damping stiffness spring_ref servo_stiffness servo_damping servo_ref gear
 motor_bias""".split()
 OF_MODEL = [*OF_SCENE, "contact_params", "limit_params", "joint_loss", "row_params"]
-UNSUPPORTED = {"drag": "a fluid", "gravcomp": "gravity compensation", "muscle": "tendons"}
+UNSUPPORTED = {"drag": "a fluid", "gravcomp": "gravity compensation", "muscle": "tendons", "tendon": "fixed tendons"}
+UNSUPPORTED |= {"site": "actuators at sites"}
 
 
 class _Robot:
@@ -244,7 +245,7 @@ class ParametricSimulator(Simulator):
     """A Simulator whose steps are differentiable in the robot's constants, which are the same in all environments.
 
     Args:
-        scene: without fluid, gravity compensation and tendons.
+        scene: without fluid, gravity compensation, tendons and actuators at sites.
         num_envs: as for Simulator, like the rest.
         integration: contact model and substeps.
         *args: control_dt and horizon.

@@ -37,6 +37,8 @@ def fingerprint(scene: Scene) -> str:
     model = scene.mj_model
     values = [getattr(model, prefix + name) for prefix, names in FIELDS.items() for name in names.split()]
     values += [getattr(model.opt, name) for name in OPTIONS.split()]
+    if "site" in scene.features:  # elsewhere sites have no orientation, and old checkpoints keep their hash
+        values.append(model.site_quat)
     return hashlib.sha256(b"".join(np.asarray(value, np.float32).tobytes() for value in values)).hexdigest()[:16]
 
 

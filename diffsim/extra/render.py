@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffsim.robot.elements import muscles
 from diffsim.robot.scene import Array, Scene
 from diffsim.tasks.base import ASSETS
 
@@ -207,9 +208,9 @@ def point(scene: mujoco.MjvScene, root: Array, arrow: Arrow) -> None:
 
 def activations(model: mujoco.MjModel, ctrl: ArrayLike) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """The tendons (m,) of a model's muscles, and their activation (..., m) in [0, 1] by ctrl (..., nu) in [-1, 1]."""
-    muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
-    force = np.asarray(ctrl, dtype=np.float64)[..., muscles].clip(-1, 1)
-    return model.actuator_trnid[muscles, 0], (force + 1) / 2
+    pulling = np.flatnonzero(muscles(model))
+    force = np.asarray(ctrl, dtype=np.float64)[..., pulling].clip(-1, 1)
+    return model.actuator_trnid[pulling, 0], (force + 1) / 2
 
 
 def orbit(model: mujoco.MjModel) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from diffsim.robot.contact import (
     hull,
     pair_law,
 )
-from diffsim.robot.elements import at_rest, control_range, label, listed, motors
+from diffsim.robot.elements import at_rest, control_range, label, listed, motors, muscles
 from diffsim.robot.pairs import as_capsules, is_exact, self_pairs
 from diffsim.robot.scene import Scene
 
@@ -53,13 +53,13 @@ def _parts(scene: Scene) -> Iterator[str]:
     m = scene.mj_model
     kinds = sorted((name.removeprefix("mjJNT_").lower(), kind) for name, kind in mujoco.mjtJoint.__members__.items())
     counts = [f"{n} {name}" for name, kind in kinds if (n := np.count_nonzero(m.jnt_type == kind))]
-    muscles = len(np.unique(scene.segment_muscle))
+    pulling = len(np.unique(scene.segment_muscle))
     ground = f"ground at z = {scene.ground_height:g} m" if scene.ncontact else "no ground that it may touch"
     yield f"links      {scene.nlink - 1} of one degree of freedom, base {'floating' if scene.floating else 'fixed'}"
     yield f"joints     {', '.join(counts)}; {np.count_nonzero(np.isfinite(scene.upper))} limited"
     yield f"state      nq {scene.nq}, nv {scene.nv}"
     yield f"mass       {scene.mass.sum():.4g} kg"
-    yield f"controls   {scene.nu - muscles} motors, {muscles} muscles"
+    yield f"controls   {scene.nu - pulling} motors, {pulling} muscles"
     yield f"timestep   {1e3 * m.opt.timestep:g} ms in the file; in a task control_dt / substeps"
     yield f"contact    {scene.ncontact} points, {ground}"
     yield f"features   {', '.join(sorted(scene.features))}"
@@ -198,6 +198,6 @@ def _actuators(scene: Scene) -> Iterator[str]:
                 "Without a task's action_scale, action 0 is the middle of a ctrlrange, not the ctrl of the file's "
                 f"keyframe: {zero[a]:g}, not {start[a]:g}, of actuator {label(m, Kind.mjOBJ_ACTUATOR, a)}{more}."
             )
-    if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
+    if (~motors(m) & muscles(m)).any():
         yield "A control sets the activation of a <muscle> at once."
         yield "A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves."

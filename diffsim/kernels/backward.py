@@ -34,6 +34,7 @@ from diffsim.kernels.parameters import parameter_adjoint
 from diffsim.kernels.solve import factor_solve
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.transmission import transmission_law
 from diffsim.kernels.wide import blocks, module_options
 from diffsim.robot.scene import FACTORS
 
@@ -44,14 +45,16 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     T, vec2, vec3, vec6, quat, Model, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Lane
     Link, Node, Adjoint, Base, Contact = t.Link, t.Node, t.Adjoint, t.Base, t.Contact
     Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.Ts
-    lane, solve = lane_of(spec), factor_solve(spec)
-    join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
+    lane, join, load, link_of, qpos_adr = lane_of(spec), sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint, parameters = muscle_law(spec), constraint_law(spec), parameter_adjoint(spec)
     PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_adjoint(spec) if spec.pairs else None
     CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
     CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT, BASE_DAMPED = spec.has("contact motor clamp muscle limit base_damping")
     LIMIT = LIMIT and not spec.constrained  # the penalty law
+    TENDON, SITE = spec.has("tendon site")
+    transmission = transmission_law(spec) if TENDON or SITE else None
+    solve = factor_solve(spec, transmission)
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     read, write, pick = block.read, block.write, block.pick
@@ -59,7 +62,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.room
     # Local arrays have at least one element, also where they are not read.
     NFACTORS, LEARNED = spec.parameters or (len(FACTORS) if VARIED else 1), spec.parameters > 0
-    TENSIONS, BODIES = (NU if MUSCLE else 1), max(spec.forced, 1)
+    PULLED = MUSCLE or TENDON or SITE
+    TENSIONS, BODIES = (NU if PULLED else 1), max(spec.forced, 1)
 
     @wp.func
     def load_vec3(a: t.array3, here: Lane, k: int):
@@ -306,6 +310,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(MUSCLE):
             for entry in range(m.muscle_begin[here.lane], m.muscle_begin[here.lane + 1]):
                 failed = failed + block.is_nonfinite(adj_tension[m.muscle[entry]])
+        if wp.static(TENDON or SITE):
+            failed = failed + transmission.count_nonfinite(adj_tension)
         if wp.static(VARIED or LEARNED):
             for k in range(NFACTORS):
                 failed = failed + block.is_nonfinite(adj_factors[k])
@@ -340,7 +346,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 g_force = T(0.0)
                 if wp.static(DRIVEN):
                     g_force = nodes[m.motor_slot[here.lane * NU + k]].gtau
-                if wp.static(MUSCLE):
+                if wp.static(PULLED):
                     g_force = g_force + adj_tension[k]
                 if wp.static(VARIED):
                     motor = T(m.gear[k]) * read(ctrl, here.e, k) + T(m.motor_bias[k])
@@ -409,7 +415,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         adj_forces = wp.zeros(shape=BODIES, dtype=vec6)
         tension = wp.zeros(shape=TENSIONS, dtype=T)
         adj_tension = wp.zeros(shape=TENSIONS, dtype=T)
-        if wp.static(CLAMP):
+        if wp.static(CLAMP and not TENDON):
             joint.motors_backward(m, here, batch.ctrl, nodes)
         if wp.static(MUSCLE):
             muscle.compute_tensions(m, here, batch.ctrl, tension)
@@ -431,6 +437,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 base = recompute_base(m, here, ck, links, nodes, base)
                 carrier = kin.carrier_position(m, load(ck.q, here.row, 0, here.e), load(ck.q, here.row, 2, here.e))
             carrier = kin.place_links(m, here, links, carrier)
+            if wp.static(TENDON):
+                transmission.drive_backward(m, here, batch.ctrl, links, nodes)
             recompute_joints(m, here, ck, links, nodes)
             # 2. to 4.
             if wp.static(PAIRS):
@@ -450,6 +458,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):
                 muscle.add_muscles_adjoint(m, here, tension, links, nodes, adj, adj_tension)
+            if wp.static(TENDON):
+                transmission.add_tendons_adjoint(m, here, batch.ctrl, links, nodes, adj_tension)
+            if wp.static(SITE):
+                transmission.add_sites_adjoint(m, here, batch.ctrl, links, nodes, adj, adj_tension)
             inward(m, here, ck, links, nodes, adj, adj_factors)
             if wp.static(BALL_SPRING):
                 ball_springs(m, here, links, nodes)

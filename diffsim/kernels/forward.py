@@ -25,6 +25,7 @@ from diffsim.kernels.pairs import pair_rows
 from diffsim.kernels.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import FAR, MAX_POSITION, MAX_SPEED, KernelSpec
+from diffsim.kernels.transmission import transmission_law
 from diffsim.kernels.wide import blocks, module_options
 
 
@@ -41,7 +42,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, sweep, constraint, newton = muscle_law(spec), articulated(spec), constraint_law(spec), newton_method(spec)
     PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_rows(spec) if spec.pairs else None
-    CONTACT, MOTOR, CLAMP, MUSCLE = spec.has("contact motor clamp muscle")
+    CONTACT, MOTOR, MUSCLE, TENDON, SITE, CHAIN = spec.has("contact motor muscle tendon site tendon_chain")
+    transmission = transmission_law(spec) if TENDON or SITE else None
     NU, FLOATING, FORCED = spec.nu, spec.floating, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
@@ -243,7 +245,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         tension = wp.zeros(shape=TENSIONS, dtype=T)
         if wp.static(MUSCLE):
             muscle.compute_tensions(m, here, batch.ctrl, tension)
-        if wp.static(MOTOR):
+        if wp.static(MOTOR and not TENDON):
             joint.motors_forward(m, here, batch.ctrl, motions)
         if wp.static(CONSTRAINED):
             free_loads = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
@@ -268,6 +270,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 force.add_forces(m, here, batch.forces, links, loads)
             if wp.static(MUSCLE):
                 muscle.add_muscles(m, here, tension, links, loads)
+            if wp.static(TENDON):
+                transmission.drive_forward(m, here, batch.ctrl, links, motions)
+            if wp.static(SITE):
+                transmission.add_sites(m, here, batch.ctrl, links, loads)
             # 2. inward and outward: articulated inertias, then accelerations. With constraints each pass is a step of
             # Newton's method (newton.py), and the adjoint uses the factor of the last iterate. MuJoCo's implicit
             # damping is one more solve: (M + h b) change = -h b a.
@@ -314,6 +320,9 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                                 m, here, links, free_loads, motions, contacts, root, status
                             )
                         else:
+                            if wp.static(CHAIN):
+                                if phase == SOLVE:
+                                    root = transmission.correct_change(m, here, links, motions, root)
                             phase = phase + 1
                             if wp.static(not DAMPED):
                                 phase = DONE

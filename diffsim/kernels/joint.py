@@ -8,9 +8,6 @@ As in contact, damping grows with the depth, and a limit never pulls. With the v
 
 Implicit step: f(q, q') - B a with B = h (b + d_limit x), of the whole passive force; x is lagged. An inactive limit
 has no part in B. The explicit law is B = 0, h = 0.
-
-Actuators with a forcerange have the force motor + k (r - q) - b q', clamped to it. At a bound the force is constant,
-and their spring and damper have no part in B; `unclamped` is 0 there and 1 elsewhere.
 """
 
 from functools import cache
@@ -18,6 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.clamp import clamp_law
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -29,7 +27,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     T, Model, Lane = t.T, t.Model, t.Lane
     vec2, block = t.vec2, blocks(spec)
     pick = block.pick
-    STIFFNESS, DAMPING, LIMIT, CLAMP = spec.has("stiffness damping limit clamp")
+    STIFFNESS, DAMPING, LIMIT, CLAMP, TENDON = spec.has("stiffness damping limit clamp tendon")
     LIMIT = LIMIT and not spec.constrained
     VARIED, NU, EXPLICIT_SERVOS = spec.varied, spec.nu, "explicit_servos" in spec.features
 
@@ -46,25 +44,8 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
 
         return motors_forward
 
-    motors_forward, motors_backward = motors(t.Motions), motors(t.Nodes) if CLAMP else None
-
-    @wp.func
-    def unclamped_force(m: Model, i: int, motor: T, q: T, qd: T):
-        return motor + T(m.servo_stiffness[i]) * (T(m.servo_ref[i]) - q) - T(m.servo_damping[i]) * qd
-
-    @wp.func
-    def actuator_force(m: Model, i: int, motor: T, q: T, qd: T):
-        """Return the force of the joint's actuators."""
-        force = motor
-        if wp.static(CLAMP):
-            force = wp.max(wp.min(unclamped_force(m, i, motor, q, qd), T(m.force_high[i])), T(m.force_low[i]))
-        return force
-
-    @wp.func
-    def actuator_unclamped(m: Model, i: int, motor: T, q: T, qd: T):
-        """Return 1 where that force is within its bounds, 0 where it is at one."""
-        force = unclamped_force(m, i, motor, q, qd)
-        return pick(T(m.force_low[i]), force, pick(force, T(m.force_high[i]), T(1.0), T(0.0)), T(0.0))
+    actuator_force, actuator_unclamped = clamp_law(spec).actuator_force, clamp_law(spec).actuator_unclamped
+    motors_forward, motors_backward = motors(t.Motions), motors(t.Nodes) if CLAMP or TENDON else None
 
     @wp.func
     def damping(m: Model, i: int, unclamped: T):

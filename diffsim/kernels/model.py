@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from diffsim.kernels.lanes import Division
-from diffsim.kernels.records import PAIR_FIELDS, add_constraints
+from diffsim.kernels.records import OPTIONAL_FIELDS, add_constraints, parts_of
 from diffsim.kernels.spec import KernelSpec
 from diffsim.robot.drag import drag
 from diffsim.robot.scene import Scene
@@ -209,15 +209,17 @@ def struct(name: str, fields: dict[str, Any]) -> Any:
 
 
 @cache
-def scene_types(dtype: type, paired: bool) -> SimpleNamespace:
-    """Make Warp's vector types of a scene's numbers, and the struct Model of them, with rows between bodies or not."""
+def scene_types(dtype: type, parts: tuple[str, ...]) -> SimpleNamespace:
+    """Make Warp's vector types of a scene's numbers, and the struct Model of them with these parts' OPTIONAL_FIELDS."""
     kinds: dict[str, Any] = {f"vec{n}": wp.types.vector(n, dtype) for n in (3, 4, 11)}
     kinds |= {"real": dtype, "int": wp.int32, "mat3": wp.types.matrix((3, 3), dtype)}
     arrays = {f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()}
     arrays |= {f"{name}ss": wp.array2d(dtype=kind) for name, kind in kinds.items()}
-    fields = FIELDS | (PAIR_FIELDS if paired else {})
+    fields = dict(FIELDS)
+    for part in parts:
+        fields |= OPTIONAL_FIELDS[part]
     members = {name: (kinds | arrays)[kind] for name, (kind, _) in fields.items()}
-    return SimpleNamespace(**kinds, Model=struct("Model", members))
+    return SimpleNamespace(**kinds, Model=struct("Model", members), fields=fields)
 
 
 @cache
@@ -338,7 +340,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
             "newton_wdot": vec3,  # angular acceleration of Newton's iterate
         },
     }
-    if "clamp" in spec.features:
+    if spec.features & {"clamp", "tendon"}:
         structs["Node"] |= {
             "motor": T,  # force of the joint's motors
             "unclamped": T,  # 1 where the actuators' force is within its bounds
@@ -349,8 +351,8 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         **kinds,
         **{f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()},
         **{"U": U, "vec2": vec2, "vec4": vec4, "mat6": mat6, "array2": array2, "array3": array3},
-        scene=scene_types(U, spec.pairs > 0),
-        Model=scene_types(U, spec.pairs > 0).Model,
+        scene=scene_types(U, parts_of(spec)),
+        Model=scene_types(U, parts_of(spec)).Model,
         CarrierPos=vec2 if "terrain" in spec.features else T,  # the carrier's (x, z), or its height
         Frame=mat3 if spec.framed else T,  # of a contact: E of terrain.py, or the world's, of which is 1
     )
@@ -363,10 +365,10 @@ def functions(names: dict[str, Any]) -> SimpleNamespace:
 
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     """Put the scene's numbers into a Model on a device."""
-    Model, entries = scene_types(dtype, scene.pairs is not None).Model, _Entries(scene, division)
-    model = Model()
-    for name, member in Model.vars.items():
-        kind, values = member.type, (FIELDS | PAIR_FIELDS)[name][1](entries)
+    t = scene_types(dtype, tuple(part for part in OPTIONAL_FIELDS if getattr(scene, part)))
+    model, entries = t.Model(), _Entries(scene, division)
+    for name, member in t.Model.vars.items():
+        kind, values = member.type, t.fields[name][1](entries)
         if isinstance(kind, wp.array) and values is not None:
             values = np.ascontiguousarray(values, np.int32 if kind.dtype is wp.int32 else float)
             # Warp gives an empty array no address; one unread element keeps the struct uniform.

@@ -30,15 +30,14 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     """Make the rows' part of the adjoint."""
     t, block, kin, geometry = types(spec), blocks(spec), kinematics(spec), pair_geometry(spec)
     rows, solver, sp = pair_rows(spec), row_solver(spec, "Nodes"), spatial(spec)
-    T, vec3, vec6, mat6, pick, join, force_at = t.T, t.vec3, t.vec6, t.mat6, block.pick, sp.join, sp.force_at
+    T, vec3, vec6, pick, join, force_at = t.T, t.vec3, t.vec6, block.pick, sp.join, sp.force_at
     Model, Lane, Ck, Links, Contacts, Nodes, Adjoints, Array = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Nodes Adjoints Ts".split()
     )
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
-    FLOATING, SOLVES, VARIED, LEARNED = spec.floating, spec.solves, spec.varied, spec.parameters > 0
+    SOLVES, VARIED, LEARNED = spec.solves, spec.varied, spec.parameters > 0
     COLUMN = 2 * spec.nv + 3 * spec.spheres  # of jar in the checkpoint
     COLUMNS = spec.parameters - 2 * spec.pairs  # see parameters.py
-    BASE = 7 * (spec.nlink - 1)
     JOINTS, POINTS, TURNS, TOUCH = spec.has("joint_rows point_rows turn_rows geoms_rows")
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]
 
@@ -67,18 +66,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     def correct_lambda(m: Model, here: Lane, links: Links, ck: Ck, contacts: Contacts, nodes: Nodes):
         """Turn the tree's lambda, and the twists under it, into those with the rows between bodies."""
         if here.end > here.begin:
-            row = SOLVES * here.row + SOLVES - 1
-            for i in range(1, here.n):
-                for r in range(6):
-                    nodes[i].U[r] = kin.load(ck.f, row, 7 * (i - 1) + r, here.e)
-                nodes[i].dinv = kin.load(ck.f, row, 7 * (i - 1) + 6, here.e)
-            L = mat6()
-            if wp.static(FLOATING):
-                k = int(BASE)
-                for r in range(6):
-                    for c in range(r + 1):
-                        L[r, c] = kin.load(ck.f, row, k, here.e)
-                        k = k + 1
+            L = solver.recall_factor(here, ck, SOLVES * here.row + SOLVES - 1, nodes)
             for c in range(here.begin, here.end):
                 contacts[c].rate = lambda_rates(m, c, contacts, nodes)
             solver.solve(m, here, links, contacts, nodes, L, T(1.0), T(ENOUGH))

@@ -23,6 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.pair_geometry import pair_geometry
 from diffsim.kernels.solve import base_inertia
@@ -41,7 +42,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     t, block, geometry, base = types(spec), blocks(spec), pair_geometry(spec), base_inertia(spec)
     T, vec3, vec6, mat6, pick = t.T, t.vec3, t.vec6, t.mat6, block.pick
     Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
-    FLOATING, ROOM = spec.floating, spec.room
+    FLOATING, ROOM, BASE, load = spec.floating, spec.room, 7 * (spec.nlink - 1), kinematics(spec).load
     STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
 
     @wp.func
@@ -97,6 +98,22 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
             branches[i].twist = A + links[i].S * accel
         branches[ROOM - 1].twist = vec6()
         branches[ROOM - 1].rate = T(0.0)
+
+    @wp.func
+    def recall_factor(here: Lane, ck: t.Checkpoint, row: int, branches: Branches):
+        """Load T's factor of a checkpoint's row; returns the base's."""
+        for i in range(1, here.n):
+            for r in range(6):
+                branches[i].U[r] = load(ck.f, row, 7 * (i - 1) + r, here.e)
+            branches[i].dinv = load(ck.f, row, 7 * (i - 1) + 6, here.e)
+        L = mat6()
+        if wp.static(FLOATING):
+            k = int(BASE)
+            for r in range(6):
+                for c in range(r + 1):
+                    L[r, c] = load(ck.f, row, k, here.e)
+                    k = k + 1
+        return L
 
     @wp.func
     def rates_of(m: Model, c: int, contacts: Contacts, branches: Branches):

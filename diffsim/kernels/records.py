@@ -25,6 +25,29 @@ PAIR_FIELDS["row_points"] = "ints", lambda n: n.scene.pairs.points[1].flat  # fi
 PAIR_FIELDS["point_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.points[0][:, 0])
 PAIR_FIELDS["point"] = "vec3s", lambda n: n.scene.pairs.points[0][:, 1:]  # m, in the link's frame
 PAIR_FIELDS["row_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.link).flat  # slots of the first and the second
+# Fields of Model with actuators on fixed tendons or at sites (robot/actuator.py); such scenes have one lane
+TRANSMISSION_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    name: (kind, lambda n, field=field: getattr(n.scene.transmissions, field))
+    for name, kind, field in (
+        ("tendon_actuator", "ints", "tendon"),
+        ("tendon_law", "vec4s", "law"),  # stiffness, damping, and bounds of the force
+        ("tendon_begin", "ints", "begin"),  # of each tendon, in the next two
+        ("tendon_slot", "ints", "link"),
+        ("tendon_coef", "reals", "coef"),
+        ("tendon_chain", "ints", "chain"),
+        ("site_actuator", "ints", "site"),
+        ("site_slot", "ints", "site_link"),
+        ("site_torque", "vec3s", "torque"),  # in the link's frame, about its origin, per force of the actuator
+        ("site_force", "vec3s", "force"),
+    )
+}
+OPTIONAL_FIELDS = {"pairs": PAIR_FIELDS, "transmissions": TRANSMISSION_FIELDS}  # by the part of Scene that has them
+
+
+def parts_of(spec: KernelSpec) -> tuple[str, ...]:
+    """Name the parts in OPTIONAL_FIELDS of a specification's scenes."""
+    used = spec.pairs > 0, bool(spec.features & {"tendon", "site"})
+    return tuple(part for part, there in zip(OPTIONAL_FIELDS, used, strict=True) if there)
 
 
 def slots_of(entries: Any, link: np.ndarray) -> np.ndarray:
@@ -58,6 +81,9 @@ def add_constraints(
             "active": T,  # 1 within the margin
         },
     }
+    if "tendon_damping" in spec.features:
+        for name in ("Motion", "Node"):
+            structs[name] |= {"tendon_damping": T}  # of the joint, implicit, by tendons; the base's of a whole chain
     if spec.framed or spec.pairs:
         structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
     if spec.constrained:
@@ -97,14 +123,15 @@ def add_constraints(
             "rate": vec3,  # acceleration of the rows by the direction
             "change": vec3,  # of the forces, by the step
         }
+        structs["Lane"] |= {
+            "begin": int,  # the first block's element of contacts
+            "end": int,  # the element after the last block that acts in the substep
+        }
+    if spec.branched:
         work = {
             "twist": vec6,  # of the link, by the forces of rows between bodies; in the inward sweep the bias force
             "rate": T,  # of its joint
         }
         structs["Motion"] |= work
         structs["Node"] |= {"U": vec6, "dinv": T} | work  # the factor as in Motion
-        structs["Lane"] |= {
-            "begin": int,  # the first block's element of contacts
-            "end": int,  # the element after the last block that acts in the substep
-        }
         structs["Root"] |= {"L": mat6}  # Cholesky factor of the base's articulated inertia

@@ -118,8 +118,8 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
     Links, Motions, Loads = t.Links, t.Motions, t.Loads
     FLOATING, IMPLICIT, CONSTRAINED = spec.floating, spec.implicit, spec.constrained
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
-    BASE_DAMPED, CLAMP = spec.has("base_damping clamp")
-    PAIRS = spec.pairs > 0
+    BASE_DAMPED, CLAMP, TENDON_DAMPING = spec.has("base_damping clamp tendon_damping")
+    PAIRS, BRANCHED = spec.pairs > 0, spec.branched
 
     @wp.func
     def joint_force(m: Model, here: Lane, k: int, phase: int, link: Link, motion: Motion, d: T):
@@ -130,9 +130,13 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(IMPLICIT):
             resistance = joint.resistance(m, here, k, link.q, link.qd, unclamped)
             d = d + here.h * resistance[1]
+            if wp.static(TENDON_DAMPING):
+                d = d + here.h * motion.tendon_damping
         if wp.static(CONSTRAINED):
             if phase == SOLVE:
                 damper = here.h * joint.end_damping(m, k, unclamped)
+                if wp.static(TENDON_DAMPING):
+                    damper = damper + here.h * motion.tendon_damping
                 d = d + damper
                 f = -damper * motion.accel_joint
             else:
@@ -210,7 +214,7 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
                 load = base.damp_base(m, here, phase == SOLVE, links[0], load, root)
             L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
             motions[0].A = a0
-            if wp.static(PAIRS):
+            if wp.static(BRANCHED):
                 root.L = L
             root.wdot = wp.transpose(links[0].R) * wp.spatial_top(a0)
             root.vdot = wp.spatial_bottom(a0)
@@ -231,13 +235,13 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
     return functions(locals())
 
 
-@cache
-def factor_solve(spec: KernelSpec) -> wp.Function:
+def factor_solve(spec: KernelSpec, chain: SimpleNamespace | None) -> wp.Function:
+    """Make the adjoint's solves; `chain` is transmission.py's law if a tendon damps a chain of joints."""
     t, kin, inertia, sums, joint = types(spec), kinematics(spec), base_inertia(spec), lane_sums(spec), joint_law(spec)
     T, vec6, load, link_of, join = t.T, t.vec6, kin.load, kin.link_of, spatial(spec).join
     Model, Lane, Ck, Links, Nodes, Base = t.Model, t.Lane, t.Checkpoint, t.Links, t.Nodes, t.Base
     FLOATING, SLOTS, SOLVES, DAMPED = spec.floating, spec.slots, spec.solves, spec.damped
-    BASE_DAMPED, CLAMP = spec.has("base_damping clamp")
+    BASE_DAMPED, CLAMP, TENDON_DAMPING, CHAIN = spec.has("base_damping clamp tendon_damping tendon_chain")
     THREADS_PER_ENV, SHARERS, TRUNK = spec.threads_per_env, spec.sharers, spec.trunk
 
     @wp.func
@@ -302,7 +306,14 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
                     nodes[i].g = (
                         nodes[i].gqd + damping_pass * joint.end_damping(m, here.at + i, unclamped) * nodes[i].lam
                     )
+                    if wp.static(TENDON_DAMPING):
+                        nodes[i].g = nodes[i].g + damping_pass * nodes[i].tendon_damping * nodes[i].lam
+            if wp.static(CHAIN):
+                chain.add_damping(m, here, damping_pass, nodes)
             solve(m, here, ck, SOLVES * here.row + s, links, nodes, g_base)
+            if wp.static(CHAIN):
+                if s == 0:
+                    chain.correct_lambda(m, here, ck, links, nodes)
             damping_pass = T(1.0)
 
     return solve_all

@@ -53,9 +53,14 @@ class KernelSpec:
         return bool(self.features & {"terrain", "pyramid"})
 
     @property
+    def branched(self) -> bool:
+        """Tell whether a matrix leaves the tree's shape (pair_solver.py)."""
+        return self.pairs > 0 or "tendon_chain" in self.features
+
+    @property
     def room(self) -> int:
-        """Return the number of links in local arrays: the last one is the world, where rows between bodies need it."""
-        return self.slots + int(self.pairs > 0)
+        """Return the number of links in local arrays: the last one is the world, where pair_solver.py needs it."""
+        return self.slots + int(self.branched)
 
     @property
     def dof0(self) -> int:
@@ -78,8 +83,8 @@ class KernelSpec:
     @property
     def damped(self) -> bool:
         """Tell whether damping follows the constraints."""
-        damping, base_damping, explicit = self.has("damping base_damping explicit_damping")
-        return self.constrained and (damping or base_damping) and not explicit
+        *dampers, explicit = self.has("damping base_damping tendon_damping explicit_damping")
+        return self.constrained and any(dampers) and not explicit
 
     @property
     def nfactor(self) -> int:

@@ -53,10 +53,17 @@ def servos(m: mujoco.MjModel) -> NDArray[np.bool_]:
     return still & affine & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
 
 
+def muscles(m: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Mark actuators on spatial tendons; a fixed tendon's length is a sum of joint positions."""
+    tendon = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
+    tendon[tendon] = m.wrap_type[m.tendon_adr[m.actuator_trnid[tendon, 0]]] != mujoco.mjtWrap.mjWRAP_JOINT
+    return tendon
+
+
 def control_range(m: mujoco.MjModel) -> tuple[Array, Array]:
     """Return the controls (nu,) of each actuator to which actions of -1 and 1 are mapped."""
-    tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
-    low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
+    limited = m.actuator_ctrllimited != 0
+    low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(muscles(m), 0.0, -1.0))
     return low, np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
 
 

@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from diffsim.robot.actuator import force_bounds, gear_of, on_joint, servo_sums, transmissions_of
 from diffsim.robot.contact import contact_points, ground_pairs
-from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, numeric, servos
+from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, muscles, numeric, servos
 from diffsim.robot.pairs import with_obstacles, with_pairs
 from diffsim.robot.refuse import beyond, obstacles, strays
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
@@ -121,6 +122,7 @@ class _Reader:
             **joints,
             **inertias,
             **self._actuators(springs),
+            transmissions=transmissions_of(m, self.nlink, self.body),
             **self._contacts(joints["slide"]),
             k_n=self._numeric("k_n", np.nan),
             k_d=self._numeric("k_d", np.nan),
@@ -183,7 +185,7 @@ class _Reader:
     def _springs(self, joint: NDArray[np.int32], ball: NDArray[np.bool_]) -> dict[str, tuple[Array, float]]:
         """Read springs, dampers and servos of each degree of freedom after the base, and the base's value of each."""
         m = self.m
-        servo, (low, high) = self._servos(), self._force_bounds()
+        servo, (low, high) = servo_sums(m, self.nlink), force_bounds(m, self.nlink)
         bounded = np.isfinite(low) | np.isfinite(high)
         push, stiffness, damping = np.where(bounded, 0.0, servo)  # these join the joint's own
         ref = np.where(ball, 0.0, m.qpos_spring[m.jnt_qposadr[joint]])  # a ball's is the identity in every MJCF
@@ -201,27 +203,6 @@ class _Reader:
             "force_low": (low, -np.inf),
             "force_high": (high, np.inf),
         }
-
-    def _servos(self) -> Array:
-        """Sum the affine biases (3, joints) of the joints' actuators: force at zero, stiffness and damping."""
-        m, sums = self.m, np.zeros((3, self.nlink - 1))
-        for a in np.flatnonzero(servos(m)).tolist():
-            link, gear = self._gear(a)
-            sums[:, link - 1] += m.actuator_biasprm[a, :3] * (gear, -(gear**2), -(gear**2))
-        return sums
-
-    def _force_bounds(self) -> Array:
-        """Read the bounds (2, joints) of the total force of each joint's actuators."""
-        m, bounds = self.m, np.tile((-np.inf, np.inf), (self.nlink - 1, 1))
-        driven = m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-        for a in np.flatnonzero(driven & (m.actuator_forcelimited != 0)).tolist():  # the only one on its joint
-            link, gear = self._gear(a)
-            bounds[link - 1] = np.sort(gear * m.actuator_forcerange[a])
-        for joint in np.unique(m.actuator_trnid[driven, 0]).tolist():
-            if m.jnt_actfrclimited[joint] and m.jnt_type[joint] != Joint.mjJNT_BALL:
-                own = bounds[self._link(joint) - 1]
-                own[:] = own.clip(*m.jnt_actfrcrange[joint])
-        return bounds.T
 
     def _inertias(self) -> dict[str, Any]:
         """Sum mass, com, inertia and gravity compensation (nlink, ...) over bodies that are welded together."""
@@ -251,17 +232,15 @@ class _Reader:
     def _actuators(self, springs: Array) -> dict[str, Any]:
         """Read actuators into columns (nu, ...); a servo's constant force is a motor's if its link has no spring."""
         m = self.m
-        tendon, (low, high) = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, control_range(m)
-        link, scale = np.zeros(m.nu, np.int32), np.zeros(m.nu)
-        segments: list[Segment] = []
-        for a in range(m.nu):
-            if tendon[a]:
-                segments += self._path(m.actuator_trnid[a, 0], a)
-                scale[a] = self._strength(a)
-            else:
-                link[a], gear = self._gear(a)
-                scale[a] = gear * m.actuator_gainprm[a, 0]
-        constant_force = np.where(servos(m) & (springs[link] == 0), m.actuator_gear[:, 0] * m.actuator_biasprm[:, 0], 0)
+        link, gear, (low, high) = np.zeros(m.nu, np.int32), np.ones(m.nu), control_range(m)
+        scale, segments = m.actuator_gainprm[:, 0].copy(), list[Segment]()
+        for a in np.flatnonzero(muscles(m)).tolist():
+            segments += self._path(m.actuator_trnid[a, 0], a)
+            scale[a] = self._strength(a)
+        for a in np.flatnonzero(on_joint(m)).tolist():
+            link[a], gear[a] = gear_of(m, a, self.nlink)
+            scale[a] *= gear[a]
+        constant_force = np.where(servos(m) & (springs[link] == 0), gear * m.actuator_biasprm[:, 0], 0)
         segments.sort(key=lambda segment: (segment.links, segment.actuator))
         return {
             "motor_link": link,
@@ -271,14 +250,6 @@ class _Reader:
             "segment_position": np.array([s.ends for s in segments]).reshape(-1, 2, 3),
             "segment_muscle": np.array([s.actuator for s in segments], np.int32),
         }
-
-    def _gear(self, a: int) -> tuple[int, float]:
-        """Return the link of a joint's actuator, and the joint's force per force of the actuator."""
-        m = self.m
-        joint, axis = m.actuator_trnid[a, 0], 0
-        if m.jnt_type[joint] == Joint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
-            axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
-        return self._link(joint) + axis, m.actuator_gear[a, axis]
 
     def _strength(self, a: int) -> float:
         """Return the force of a tendon's actuator per activation."""

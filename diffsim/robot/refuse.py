@@ -7,8 +7,9 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from diffsim.robot.actuator import Mask, at_site, driven, on_joint, on_tendon, refused, turning
 from diffsim.robot.contact import POINTS, declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import (
     at_rest,
@@ -19,14 +20,14 @@ from diffsim.robot.elements import (
     listed,
     mass_matrix,
     motors,
+    muscles,
     numeric,
     servos,
 )
 from diffsim.robot.pairs import rough_obstacles
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
 
-Joint, Transmission = mujoco.mjtJoint, mujoco.mjtTrn
-Mask = NDArray[np.bool_]
+Joint = mujoco.mjtJoint
 # The kind of an element, a mask of those elements or their names, and what is not simulated of them
 Row = tuple[str, ArrayLike | list[str], str]
 
@@ -147,10 +148,10 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
     armature = m.dof_armature[m.jnt_dofadr] != 0
     fluid = m.opt.density + m.opt.viscosity > 0
-    tendons = (m.actuator_trntype == Transmission.mjTRN_TENDON).any()
+    pushed = (muscles(m) | at_site(m)).any()
     yield "joint", ball & limited, "the limit of a ball joint is not simulated"
     yield "joint", limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
-    yield "joint", bounded & tendons, "actuatorfrcrange together with muscles is not simulated"
+    yield "joint", bounded & pushed, "actuatorfrcrange together with muscles or actuators at sites is not simulated"
     yield "joint", bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
     yield "joint", free & (m.jnt_stiffness != 0), "a free joint has no stiffness here; write <freejoint/>"
     yield "joint", free & armature & fluid, "armature of a free joint in a fluid is not simulated"
@@ -174,31 +175,32 @@ def _inertia(m: mujoco.MjModel) -> Iterator[Row]:
 def _tendons(m: mujoco.MjModel) -> Iterator[Row]:
     """Check tendons with actuators; a tendon without actuator and without a force of its own has no effect."""
     spatial, held = np.ones(m.ntendon, bool), np.zeros(m.nsite, bool)
-    for tendon in np.unique(m.actuator_trnid[m.actuator_trntype == Transmission.mjTRN_TENDON, 0]).tolist():
+    for tendon in np.unique(m.actuator_trnid[muscles(m), 0]).tolist():
         path = slice(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
         spatial[tendon] = (m.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE).all()
         if spatial[tendon]:
             held[m.wrap_objid[path]] = True
     world = (m.body_weldid[m.site_bodyid] == 0) & floating(m)
-    yield "tendon", ~spatial, "only spatial tendons through sites, without pulleys or wrapping geoms"
+    yield "tendon", ~spatial, "only fixed tendons, or spatial ones through sites, without pulleys or wrapping geoms"
     yield "site", held & world, "a muscle of a floating robot cannot hold on to the world"
 
 
 def _actuators(m: mujoco.MjModel) -> Iterator[Row]:
     count = len(m.actuator_trntype)  # a PID has several of nu controls
-    tendon, group = m.actuator_trntype == Transmission.mjTRN_TENDON, np.array(m.actuator_group)
+    tendon, joint, fixed, group = muscles(m), on_joint(m), on_tendon(m), np.array(m.actuator_group)
     off = (group >= 0) & (group < 31) & ((m.opt.disableactuator >> group.clip(0, 30)) & 1 == 1)
-    pulls, turns = _pulls(m, count), _turns(m)
+    pulls, turns = _pulls(m, count), turning(m)
     negative = servos(m) & (m.actuator_biasprm[:count, 1:3] > 0).any(1)
-    bounded, joint = m.actuator_forcelimited[:count] != 0, np.where(tendon, -1, m.actuator_trnid[:count, 0])
-    shared = (joint[:, None] == joint).sum(1) > 1
+    bounded, others = m.actuator_forcelimited[:count] != 0, ~tendon & ~turns & ~fixed & ~at_site(m)
+    shared = joint & (np.bincount(driven(m), minlength=1)[np.where(joint, m.actuator_trnid[:count, 0], 0)] > 1)
     idle = tendon & ~motors(m) & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
     yield "actuator", off, "its group is in actuatorgroupdisable; remove the actuator"
     yield "actuator", tendon & ~pulls, f"only {ON_TENDON}"
     found = np.array([_unlike_a_motor(m, a) for a in range(count)])
-    for words in dict.fromkeys(found[~tendon & ~turns].tolist()):
-        yield "actuator", ~tendon & ~turns & (found == words), f"only {ON_JOINT}, or muscles on tendons, not {words}"
-    yield "actuator", turns & negative, "stiffness and damping of a servo must not be negative"
+    for words in dict.fromkeys(found[others].tolist()):
+        yield "actuator", others & (found == words), f"only {ON_JOINT}, or muscles on tendons, not {words}"
+    yield from (("actuator", which, why) for which, why in refused(m))
+    yield "actuator", (turns | fixed) & negative, "stiffness and damping of a servo must not be negative"
     yield "actuator", pulls & idle, "its force follows from what it moves, and it moves nothing; give force"
     yield "actuator", bounded & (tendon | shared), "forcerange is simulated of a joint's only actuator"
 
@@ -211,15 +213,6 @@ def _unlike_a_motor(m: mujoco.MjModel, a: int) -> str:
         if (word := kind(number).name.partition("_")[2].lower()) != usual:
             return f"{name} {word}"
     return "on this joint"
-
-
-def _turns(m: mujoco.MjModel) -> Mask:
-    """Mark motors and servos of a hinge or of a slide, and motors of one axis of a ball joint."""
-    turns = (motors(m) | servos(m)) & (m.actuator_trntype == Transmission.mjTRN_JOINT)
-    found = np.flatnonzero(turns)
-    kind, axes = m.jnt_type[m.actuator_trnid[found, 0]], np.count_nonzero(m.actuator_gear[found, :3], axis=1)
-    turns[found] = np.where(kind == Joint.mjJNT_BALL, motors(m)[found] & (axes <= 1), kind != Joint.mjJNT_FREE)
-    return turns
 
 
 def _pulls(m: mujoco.MjModel, count: int) -> Mask:

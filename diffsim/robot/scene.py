@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from diffsim.robot.terrain import TerrainError, check_terrain
 
 if TYPE_CHECKING:
+    from diffsim.robot.actuator import Transmissions
     from diffsim.robot.constraint import Constraints
     from diffsim.robot.pairs import Pairs
 
@@ -133,6 +134,7 @@ class Scene:
     left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
     geom_pairs: tuple[tuple[int, int], ...] = ()  # of the robot's geoms that may touch each other, see robot/pairs.py
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
+    transmissions: Transmissions | None = None  # actuators on fixed tendons and at sites, whose motor_link is 0
     parameters: int = 0  # number of constants whose gradients the backward kernel computes, see extra/parameters.py
 
     @property
@@ -208,6 +210,7 @@ class Scene:
             "drag": self.density > 0 or self.viscosity > 0,
         }
         rows = self.pairs.features if self.pairs else frozenset[str]()
+        rows |= self.transmissions.features(law is not None, explicit=euler) if self.transmissions else rows
         return frozenset(name for name, used in present.items() if used) | rows
 
     @property
@@ -221,6 +224,7 @@ class Scene:
         while not self.floating and link + 1 < self.nlink and self.slide[link + 1]:
             children = np.flatnonzero(self.parent[1:] == link) + 1
             busy = [*self.contact_link, *self.segment_link.flat, *(self.pairs.link.flat if self.pairs else [])]
+            busy += [*self.transmissions.site_link] if self.transmissions else []
             if len(children) != 1 or self.mass[link] > 0 or link in busy:
                 break
             link += 1

@@ -46,6 +46,18 @@ def asset(geom: str, content: str) -> str:
 HILLS = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
 TETRAHEDRON = '<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
 FIXED = '<tendon><fixed name="string"><joint joint="hinge" coef="1"/></fixed></tendon>'
+CHAIN = """
+<mujoco> <option integrator="Euler"/>
+  <worldbody> <body> <joint name="a"/> <geom size="1"/> <body> <joint axis="1 0 0"/> <geom size="1"/>
+    <body> <joint name="b"/> <geom size="1"/> </body> </body> <body> <joint name="c"/> <geom size="1"/> </body> </body>
+  </worldbody>
+  <tendon>
+    <fixed name="t"> <joint joint="b" coef="1"/> <joint joint="a" coef="1"/> </fixed>
+    <fixed name="all"> <joint joint="b" coef="1"/> <joint joint="a" coef="1"/> <joint joint="c" coef="1"/> </fixed>
+  </tendon>
+  <actuator> <velocity name="m" tendon="t"/> {} </actuator>
+</mujoco>"""
+CHAINS = '<position tendon="t" kv="1"/>', '<velocity tendon="all"/>'
 RAG = '<flex name="rag" dim="1" body="arm arm" vertex="0 0 0 1 0 0" element="0 1"/>'
 REFUSED = {  # what the variants of test_variants.py have not
     # joints
@@ -59,7 +71,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "joint 'j': actuatorgravcomp within actuatorfrcrange is not simulated": robot(
         f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BALL}</body>'
     ),
-    "joint 'weak': actuatorfrcrange together with muscles is not simulated": tendon(
+    "joint 'weak': actuatorfrcrange together with muscles or actuators at sites is not simulated": tendon(
         joint='<joint name="weak" actuatorfrcrange="-1 1"/>', actuator=MUSCLES
     ),
     "joint 'a', 'b': they have a motion without inertia": [
@@ -108,6 +120,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "actuator 'm': stiffness and damping of a servo must not be negative": [
         actuator("position", 'kp="-5"'),
         actuator("velocity", 'kv="-2"'),
+        pendulum(rest=f'{FIXED}<actuator><position name="m" tendon="string" kp="-5"/></actuator>'),
     ],
     "actuator 'm': only motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on": [
         free("", '<actuator><motor name="m" joint="r"/></actuator>'),
@@ -124,10 +137,9 @@ REFUSED = {  # what the variants of test_variants.py have not
     ),
     # tendons and muscles
     "tendon 'string': a second number of damping is not simulated": tendon(spring='damping="0 3"'),
-    "tendon 'string': only spatial tendons through sites, without pulleys or wrapping geoms": [
+    "tendon 'string': only fixed tendons, or spatial ones through sites, without pulleys or wrapping geoms": [
         tendon('<geom geom="g"/>', actuator=MUSCLES),
         tendon('<pulley divisor="2"/><site site="w"/><site site="a"/>', actuator=MUSCLES),
-        pendulum(rest=f'{FIXED}<actuator><motor tendon="string" gear="-1"/></actuator>'),
     ],
     "site 'w': a muscle of a floating robot cannot hold on to the world": tendon(
         joint="<freejoint/>", actuator=MUSCLES
@@ -141,6 +153,25 @@ REFUSED = {  # what the variants of test_variants.py have not
     "actuator 'biceps': its force follows from what it moves, and it moves nothing; give force": tendon(
         actuator=MUSCLES.replace('force="5"', 'force="-5"')
     ),
+    "actuator 'm': only motors, position and velocity servos on a fixed tendon": [
+        pendulum(rest=f"{FIXED}<actuator><{kind}/></actuator>")
+        for kind in (
+            'muscle name="m" tendon="string" lengthrange="1 2"',
+            'general name="m" tendon="string" dyntype="filter"',
+        )
+    ],
+    "damping of tendons is simulated along one chain of joints, or with the integrator Euler": [
+        CHAIN.replace("Euler", integrator).format(more)
+        for integrator in ("implicitfast", "implicit")
+        for more in CHAINS
+    ],
+    "actuator 'm': forcerange is simulated of a joint's only actuator": pendulum(
+        rest=f'{FIXED}<actuator><motor tendon="string"/><motor name="m" joint="hinge" forcerange="-1 1"/></actuator>'
+    ),
+    "actuator 'm': only motors at a site, without refsite and forcerange": [
+        pendulum(inside='<site name="s"/><site name="r"/>', rest=f'<actuator><{kind} name="m" site="s"/></actuator>')
+        for kind in ("velocity", 'motor refsite="r"', 'motor forcerange="-1 1"', 'general dyntype="filter"')
+    ],
     # the file
     "numeric k_n: must be one number, not negative": [
         pendulum(rest=f'<custom><numeric name="k_n" data="{data}"/></custom>') for data in ("-1", "1 2")
@@ -248,3 +279,10 @@ def test_what_has_no_effect_is_no_obstacle():
         )
     )
     assert scene.features == {"hinge", "contact"}
+
+
+def test_damping_along_one_chain_is_simulated():
+    """With an integrator that damps implicitly; Euler damps any number explicitly."""
+    assert parse(CHAIN.replace("Euler", "implicitfast").format("")).transmissions.chain == [0]
+    for more in CHAINS:
+        parse(CHAIN.format(more))

@@ -130,7 +130,7 @@ VARIANTS = {
     ],
 }
 CASES = [(place, text) for place, texts in VARIANTS.items() for text in texts]
-REFUSED = 39
+REFUSED = 38
 
 
 def scene_of(place: str, text: str) -> Scene:

@@ -1,0 +1,136 @@
+"""Actuators on fixed tendons and at sites: against MuJoCo, and their gradients against differences."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import reference
+import torch
+from scenes import DRONE, GRIPPER, free_states, parse, pendulum, run
+from test_constraint import SLOW, check_gradients, check_step, enough_passes  # noqa: F401
+from test_containment import step_and_gradients
+from test_dynamics import mujoco_acceleration, relative_error
+from test_gradient import check_gradients as check_soft_gradients
+from test_gradient import gradients, weights
+
+from diffsim.extra.mirror import reflections
+from diffsim.extra.own_task import start_control
+from diffsim.extra.parameters import ParametricSimulator
+from diffsim.robot.elements import control_range
+from diffsim.robot.scene import FACTORS, Scene, SceneError
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
+
+EXACT = Integration("mujoco", 1, tolerance=1e-12)
+CASES = ["implicitfast", "Euler", "drone"]
+
+
+def case(name: str, count: int, rng: np.random.Generator) -> tuple[Scene, list[np.ndarray]]:
+    """A gripper by its integrator, or the drone near the ground, and states."""
+    if name == "drone":
+        scene = parse(DRONE)
+        qpos, qvel, ctrl = free_states(scene, count, rng)
+        depth = [reference.contacts(scene, *state)[0].min() for state in zip(qpos, qvel, strict=True)]
+        qpos[:, 2] -= np.array(depth) + 0.01 * rng.normal(size=count)
+        return scene, [qpos, qvel, ctrl]
+    scene = parse(GRIPPER.format(integrator=name))
+    return scene, [*free_states(scene, count, rng)]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_steps_are_mujocos(name, rng):
+    """Forces are within their bounds and at each of them, those of actuators and those of joints."""
+    scene, states = case(name, 128, rng)
+    check_step(scene, states, 1.0)
+    if name != "drone":
+        law, (low, high) = scene.transmissions.law, control_range(scene.mj_model)
+        data, zones = mujoco.MjData(scene.mj_model), set()
+        for qpos, qvel, ctrl in zip(*states, strict=True):
+            data.qpos, data.qvel, data.ctrl = qpos, qvel, low + (ctrl + 1) / 2 * (high - low)
+            mujoco.mj_forward(scene.mj_model, data)
+            force, push = data.actuator_force[0], data.qfrc_actuator[1]
+            zones |= {("tendon", *(force <= law[0, 2], force >= law[0, 3])), ("joint", *(push <= -8, push >= 9))}
+        assert len(zones) == 6
+
+
+@pytest.mark.parametrize("name", CASES[1:])
+def test_accelerations_are_mujocos(name, rng):
+    """Without ground and constraints, on soft contact."""
+    scene, states = case(name, 64, rng)
+    scene.mj_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    if name == "drone":
+        states[0][:, 2] += 9.0
+    qvel = run(scene, *states, control_dt=1.0, integration=Integration(substeps=1))[1]
+    assert relative_error(qvel - states[1], mujoco_acceleration(scene, *states)) < 1e-10
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_are_those_of_differences(name, rng):
+    scene, states = case(name, 32, rng)
+    factors = {"factors": rng.uniform(0.7, 1.4, (32, len(FACTORS)))} if name == "implicitfast" else None
+    check_gradients(scene, states, rng, factors)
+
+
+@pytest.mark.parametrize("implicit", [pytest.param(False, marks=SLOW), True])
+@pytest.mark.parametrize("name", CASES[1:])
+def test_gradients_on_soft_contact_are_those_of_differences(name, implicit, rng):
+    scene, states = case(name, 16, rng)
+    factors = {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))}
+    check_soft_gradients(scene, states, rng, factors, integration=Integration("soft", 8, implicit))
+
+
+@pytest.mark.parametrize("name", ["implicitfast", "drone"])
+def test_blocks_in_single_precision_are_near(name, rng):
+    scene, states = case(name, 9, rng)
+    w, found = weights(scene, rng), []
+    for dtype, tolerance, block in ((torch.float32, 1e-4, 8), (torch.float64, 1e-11, 1)):
+        how = {"integration": Integration("mujoco", 4, tolerance=tolerance), "control_dt": 4 / 240, "block": block}
+        found.append(np.concatenate([*run(scene, *states, dtype=dtype, **how)], axis=1))
+        found.append(np.concatenate(gradients(scene, states, w, dtype, **how), axis=1))
+    for value, expected, enough in zip(found[:2], found[2:], (1e-4, 1e-2), strict=True):
+        assert np.linalg.norm(value - expected) < enough * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("where, value", [(0, np.nan), (1, np.inf), (2, np.nan)])
+@pytest.mark.parametrize("name", ["implicitfast", "drone"])
+def test_what_is_not_finite_stays_in_its_environment(name, where, value, rng):
+    scene, states = case(name, 9, rng)
+    sim = Simulator(scene, 9, Integration("mujoco", 4), 4 / 240)
+    expected = [x.clone() for part in step_and_gradients(sim, states) for x in part]
+    states[where][2, 0] = value
+    found = [x for part in step_and_gradients(sim, states) for x in part]
+    assert sim.nonfinite.nonzero().flatten().tolist() == [2] and not sim.nonfinite_gradients.any()
+    others = [k for k in range(9) if k != 2]
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x[others], y[others], rtol=0, atol=0)
+    assert all((x[2] == 0).all() and y[2].any() for x, y in zip(found[2:], expected[2:], strict=True))
+
+
+def test_actions_and_the_start_of_a_tendon():
+    """An action covers the ctrlrange, or without one [-1, 1]; the start's control is that without force."""
+    scene = parse(GRIPPER.format(integrator="Euler"))
+    m, data = scene.mj_model, mujoco.MjData(scene.mj_model)
+    np.testing.assert_array_equal(control_range(m), [[-1.0] * m.nu, [2.0, *[1.0] * (m.nu - 1)]])
+    data.qpos = m.key_qpos[0]
+    data.ctrl = start_control(m)
+    mujoco.mj_forward(m, data)
+    assert data.ctrl[0] != 0 and abs(data.actuator_force).max() < 1e-12
+
+
+def test_what_such_actuators_do_not_have_is_named():
+    scene = parse(DRONE)
+    with pytest.raises(ValueError, match="threads_per_env is 2, must be 1 with actuators on fixed tendons or at sites"):
+        Simulator(scene, 1, Integration("mujoco", 4), division=(2, 1))
+    with pytest.raises(SceneError, match="parameters are not supported with fixed tendons, actuators at sites"):
+        ParametricSimulator(scene, 1)
+    tendon = '<tendon><fixed name="t"><joint joint="hinge" coef="1"/></fixed></tendon>'
+    driven = parse(pendulum(rest=f'{tendon}<actuator><motor name="pull" tendon="t"/></actuator>'))
+    with pytest.raises(ValueError, match="actuator 'pull' has no known mirror image: it is on no joint"):
+        reflections(driven.mj_model, [("right", "left")], "cpu", torch.float32)
+
+
+def test_a_site_on_the_world_pushes_nothing():
+    rest = '<actuator><motor site="w" gear="1 1 1 1 1 1"/><motor joint="hinge"/></actuator>'
+    scene = parse(pendulum(world='<site name="w"/>', rest=rest))
+    assert scene.transmissions is None and scene.features == {"hinge", "motor"}
