@@ -15,7 +15,6 @@ from diffsim.extra.robots.common import score
 from diffsim.extra.robots.joystick import Go2
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
-from diffsim.tasks.base import ASSETS
 
 RADIUS, MASS, DRAG = 0.11, 0.43, 0.002  # m, kg, N s/m and N m s: a football of size 5 that comes to rest
 STIFFNESS, RANGE = 40.0, {"hip": (-0.4, 0.4), "thigh": (0.2, 1.6), "calf": (-2.5, -1.1)}  # N m/rad, rad: as of "go2"
@@ -31,22 +30,25 @@ class Dribble(Go2):
     follows leads the robot behind the ball.
     """
 
-    name, asset, symmetric = "dribble", "go2.xml", False
+    name, asset, symmetric = "dribble", "mujoco_menagerie/unitree_go2/scene.xml", False
     num_random = Go2.num_random + 13
     actor_dim, obs_dim, obs_parts = BALL + (Go2.actor_dim or 0), BALL + Go2.obs_dim, ()
 
     @classmethod
     def load_robot(cls) -> Scene:
-        return load_scene(cls.prepare(mujoco.MjSpec.from_file(str(ASSETS / cls.asset))))
+        """Let only feet and the ball touch the ground, and only the ball the rest of the robot."""
+        spec = cls.prepare(mujoco.MjSpec.from_file(str(super().load_robot().path)))
+        for geom in spec.geoms:
+            if geom.name not in ("floor", "ball", "FL", "FR", "RL", "RR"):
+                geom.contype = geom.conaffinity = 0
+        return load_scene(spec)
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec) -> mujoco.MjSpec:
         """Put servos on a Go2's motors, and add a ball that touches the ground and the robot's shapes but meshes."""
         for motor in spec.actuators:
-            if motor.biastype == mujoco.mjtBias.mjBIAS_NONE:
-                kind = motor.target.partition("_")[2].removesuffix("_joint")
-                motor.forcerange, motor.ctrlrange = list(motor.ctrlrange), RANGE[kind]
-                motor.set_to_position(kp=STIFFNESS)
+            motor.set_to_position(kp=STIFFNESS)
+            motor.forcerange, motor.ctrlrange = list(motor.ctrlrange), RANGE[motor.name.partition("_")[2]]
         ball = spec.worldbody.add_body(name="ball", pos=[0.6, 0, RADIUS])
         ball.add_joint(type=mujoco.mjtJoint.mjJNT_FREE, damping=[DRAG, 0, 0])
         ball.add_geom(name="ball", size=[RADIUS, 0, 0], mass=MASS, contype=1, conaffinity=0, rgba=[0.9, 0.4, 0.1, 1])
