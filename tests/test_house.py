@@ -12,8 +12,9 @@ CONTRIBUTING = PACKAGE.parent / "CONTRIBUTING.md"
 # Laws that the core has as features of a KernelSpec, and that the paper's six tasks do without
 OPTIONAL = """kernels/constraint kernels/newton kernels/drag kernels/force kernels/terrain kernels/lanes
 kernels/exchange kernels/cone kernels/records kernels/pairs kernels/pair_adjoint kernels/pair_geometry
-kernels/pair_solver kernels/parameters kernels/clamp kernels/transmission robot/actuator robot/pairs robot/constraint
-robot/terrain robot/drag sim/tangent sim/adjoint sim/elevation""".split()
+kernels/pair_solver kernels/pair_list kernels/capsule_contacts kernels/box_contacts kernels/parameters kernels/clamp
+kernels/transmission robot/actuator robot/pairs robot/constraint robot/terrain robot/drag sim/tangent sim/adjoint
+sim/elevation""".split()
 
 
 def lines(*patterns: str) -> int:

@@ -28,9 +28,10 @@ enough_passes = test_constraint.enough_passes
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs
 TANGLED = "floating", "fixed", "objects"
 BASES = ["floating", *(pytest.param(base, marks=SLOW) for base in ("fixed", "planar", "ball"))]
+VERSION = tuple(map(int, mujoco.__version__.split(".")[:2]))
 # Of which MuJoCo has added dJ/dt v to connect and weld
-WITH_DRIFT = tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 7)
-needs_drift = pytest.mark.skipif(not WITH_DRIFT, reason="MuJoCo before 3.7 leaves dJ/dt v out of connect and weld")
+needs_drift = pytest.mark.skipif(VERSION < (3, 7), reason="MuJoCo before 3.7 leaves dJ/dt v out of connect and weld")
+needs_manifolds = pytest.mark.skipif(VERSION < (4, 0), reason="MuJoCo before 4 has other contacts of boxes")
 
 
 def tied_tree(base, seed):
@@ -345,6 +346,103 @@ def apart_from_itself(scene):
     return m
 
 
+def solids(cone, seed):
+    """Two boxes and a capsule, all free, and a capsule that slides beside that one; all of them touch each other."""
+    rng = np.random.default_rng(seed)
+
+    def geom(kind):
+        size, place = (" ".join(map(str, x)) for x in (rng.uniform(0.04, 0.12, 3), 0.02 * rng.normal(size=3)))
+        turn = "0 0 0" if kind == "capsule" else "10 20 30"
+        friction, margin = rng.uniform(0.2, 1.5), rng.choice([0, 0.01])
+        shape = f'type="{kind}" size="{size}" pos="{place}" euler="{turn}"'
+        return f'<geom {shape} friction="{friction}" margin="{margin}" {law(rng)}/>'
+
+    slide = '<joint type="slide" damping="1" axis="{}"/>'.format
+    beside = f'<body> {slide("1 .3 0")} <geom size=".02" contype="0" conaffinity="0"/> <body> {slide(".2 0 1")}'
+    shapes = geom("box"), geom("box"), f"{geom('capsule')} {beside} {geom('capsule')} </body> </body>"
+    bodies = "".join(f"<body> <freejoint/> {shape} </body>" for shape in shapes)
+    option = f'<option cone="{cone}" impratio="{rng.uniform(0.5, 3)}"/>'
+    return parse(f"<mujoco> {option} <worldbody> {bodies} </worldbody> </mujoco>")
+
+
+def solid_states(scene, number, rng):
+    """Random states of theirs in which most of them overlap."""
+    (qpos, qvel, ctrl), m = free_states(scene, number, rng), scene.mj_model
+    for adr, kind in zip(m.jnt_qposadr, m.jnt_type, strict=True):
+        place = qpos[:, adr : adr + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 1)]
+        place[:] = 0.1 * rng.normal(size=place.shape)
+    return qpos, 0.3 * qvel, ctrl
+
+
+@needs_manifolds
+@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
+def test_boxes_and_capsules_touch_as_in_mujoco(cone, rng):
+    """At faces and edges, ends and corners, with several contacts of a pair."""
+    errors, numbers = [], set()
+    for seed in range(10):
+        scene = solids(cone, seed)
+        states, model = solid_states(scene, 32, rng), model_as_it_is(scene)
+        (_, qvel, residual), expected = step(scene, states), in_mujoco(scene, *states, model=model)[1]
+        assert residual.max() < 1e-10
+        errors.append(abs(qvel - expected).max(1) / (1e-3 + abs(expected - states[1]).max(1)))
+        data = mujoco.MjData(model)
+        for qpos in states[0]:
+            data.qpos = qpos
+            mujoco.mj_fwdPosition(model, data)
+            pairs, contacts = np.unique(data.contact.geom, axis=0, return_counts=True)
+            numbers |= {(*sorted(model.geom_type[pair].tolist()), n) for pair, n in zip(pairs, contacts, strict=True)}
+    capsule, box = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_BOX)
+    assert numbers >= {(box, box, n) for n in range(1, 7)} | {
+        (capsule, box, 1),
+        (capsule, box, 2),
+        (capsule, capsule, 2),
+    }
+    assert np.max(errors) < 1e-6 and np.median(errors) < 1e-10
+
+
+@needs_manifolds
+@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
+def test_gradient_through_several_contacts_is_that_of_differences(cone, rng):
+    """Where nothing is thrown about, as above."""
+    for seed in range(3):
+        scene = solids(cone, seed)
+        states = solid_states(scene, 96, rng)
+        ends, apart = (step(each, states, 4)[1] for each in (scene, dataclasses.replace(scene, geom_pairs=())))
+        touches = abs(ends - apart).max(1) > 1e-3
+        calm = np.argsort(np.where(touches, abs(ends).max(1), np.inf))[:6]
+        assert touches[calm].all()
+        check_gradients(scene, [x[calm] for x in states], rng)
+
+
+@SLOW
+def test_several_contacts_in_single_precision_are_near(rng):
+    scene = solids("elliptic", 0)
+    states = solid_states(scene, 64, rng)
+    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=8)
+    expected = step(scene, states, 4)[1]
+    assert residual.max() < 1e-4 and np.median(abs(qvel - expected).max(1) / abs(expected).max(1)) < 1e-4
+    for k in range(0, 64, 8):
+        check_neighbours(scene, [x[k : k + 8] for x in states])
+
+
+@needs_manifolds
+@SLOW
+def test_a_stack_of_boxes_rests_as_in_mujoco():
+    """Of equal ones, exactly one on the other, and a turned one, a second after they fell on each other."""
+    bodies = "".join(
+        f'<body pos="{0.01 * (k == 3)} 0 {0.1 * k + 0.05}" euler="0 0 {turn}"> <freejoint/> '
+        '<geom type="box" size=".05 .05 .05"/> </body>'
+        for k, turn in enumerate((0, 0, 0, 30))
+    )
+    scene = parse(robot(bodies))
+    states = scene.qpos0[None], np.zeros((1, scene.nv)), np.zeros((1, 0))
+    qpos, qvel, residual = step(scene, states, 240)
+    expected = in_mujoco(scene, *states, substeps=240, model=model_as_it_is(scene))
+    assert residual.max() < 1e-10 and abs(qvel).max() < 0.02
+    np.testing.assert_allclose(qpos, expected[0], atol=1e-5)
+    np.testing.assert_allclose(qpos.reshape(4, 7)[:, 2], scene.qpos0.reshape(4, 7)[:, 2], atol=2e-3)
+
+
 def test_other_shapes_touch_as_their_capsules(rng):
     """Which MuJoCo has in their place here."""
     arms = ""
@@ -358,26 +456,34 @@ def test_other_shapes_touch_as_their_capsules(rng):
     scene = with_pairs(parse(robot(arms, mesh, "")))
     states = rng.uniform(-2, 2, (32, 6)), 0.3 * rng.normal(size=(32, 6)), np.zeros((32, 0))
     _, expected, kinds = in_mujoco(scene, *states, model=as_capsules(model_as_it_is(scene)))
-    assert approximations(scene) == ("Shapes that touch others as capsules: 4 (surfaces differ by up to 105 mm).",)
+    assert approximations(scene) == ("Shapes that touch others as capsules: 3 (surfaces differ by up to 105 mm).",)
     assert len(scene.geom_pairs) == 15 and STATES["quadratic"] in kinds
     np.testing.assert_allclose(step(scene, states)[1], expected, rtol=1e-8, atol=1e-8)
-    plates = '<body pos="0 0 {}"> <joint/> <geom type="box" size=".2 .2 .01"/> </body>'
+    plates = '<body pos="0 0 {}"> <joint/> <geom type="cylinder" size=".2 .01"/> </body>'
     assert not with_pairs(parse(robot(plates.format(0) + plates.format(0.1), "", ""))).geom_pairs  # capsules overlap
 
 
 @SLOW
 def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
-    """Steps that lack one count as unconverged, and no others."""
+    """Steps that lack one count as unconverged, and no others; they have the deepest ones."""
     scene, states = tangled("fixed", "elliptic", 0, 64, rng)
     model, pairs = model_as_it_is(scene), {(min(pair), max(pair)) for pair in scene.geom_pairs}
-    data, numbers = mujoco.MjData(model), []
+    data, touching = mujoco.MjData(model), []
     for qpos in states[0]:
         data.qpos = qpos
         mujoco.mj_fwdPosition(model, data)
-        numbers.append(sum((min(pair), max(pair)) in pairs for pair in data.contact.geom.tolist()))
+        ends = [(min(pair), max(pair)) for pair in data.contact.geom.tolist()]
+        depth = {pair: -contact.dist for pair, contact in zip(ends, data.contact, strict=True) if pair in pairs}
+        touching.append(sorted(depth, key=depth.get))
+    numbers = np.array([len(each) for each in touching])
     monkeypatch.setattr(robot_pairs, "MOST_PAIRS", 2)
-    residual = step(scene, states)[2]
-    assert ((residual > 1e-4) == (np.array(numbers) > 2)).all() and 2 in numbers and max(numbers) > 2
+    _, qvel, residual = step(scene, states)
+    assert ((residual > 1e-4) == (numbers > 2)).all() and 2 in numbers
+    for k in np.flatnonzero(numbers > 2).tolist():
+        alone = dataclasses.replace(scene, geom_pairs=tuple(sorted(touching[k][-2:])))
+        expected = step(alone, [x[k : k + 1] for x in states])[1]
+        np.testing.assert_allclose(qvel[k], expected[0], rtol=1e-8, atol=1e-8)
+    assert any(each[0] != max(each) for each in touching if len(each) > 2)
 
 
 @SLOW
@@ -391,12 +497,15 @@ def test_contact_in_single_precision_is_near(rng):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("kind", ["tied", "tangled"])
+@pytest.mark.parametrize("kind", ["tied", "tangled", "solid"])
 def test_rows_on_a_gpu_are_the_cpus(kind, rng):
     scene = tied_tree("floating", 0)
     states, found = tied_states(scene, 40, rng), []
     if kind == "tangled":
         scene, states = tangled("floating", "elliptic", 0, 40, rng)
+    if kind == "solid":
+        scene = solids("elliptic", 0)
+        states = solid_states(scene, 40, rng)
     for device in ("cpu", "cuda"):
         integration = Integration("mujoco", 2, tolerance=1e-11)
         sim = Simulator(scene, 40, integration, 2 * H, dtype=torch.float64, device=device)

@@ -74,6 +74,8 @@ class _Robot:
         # Servos whose kp, whose kv is their gain
         gain, bias = m.actuator_gainprm[:, 0], m.actuator_biasprm
         self.tied = [servos(m) & (bias[:, k] == -gain) for k in (1, 2)]
+        rows = constrained(scene, m.opt.timestep).pairs if hard else None
+        self.touching = [scene.geom_pairs[k] for k in rows.geom_pairs] if rows else []  # of each block of two geoms
         self._read_bodies()
         self._read_actuators()
         self._read_contacts()
@@ -124,7 +126,7 @@ class _Robot:
         m, spheres = self.m, self.scene.spheres
         geoms = spheres.geom[np.argsort(spheres.link, kind="stable")].tolist() if self.hard else []
         ground = ground_pairs(m)[0][0] if geoms else 0
-        touching = [*((ground, geom) for geom in geoms), *self.scene.geom_pairs]
+        touching = [*((ground, geom) for geom in geoms), *self.touching]
         pairs, has_friction = np.zeros((len(touching), 2), int), np.zeros(len(touching), bool)
         for k, (a, b) in enumerate(touching):
             declared = tuple(sorted((a, b))) in declared_pairs(m)  # with a friction of its own
@@ -151,7 +153,7 @@ class _Robot:
             if m.eq_type[k] == mujoco.mjtEq.mjEQ_WELD:
                 of_blocks.append(m.nv + m.nbody + bodies)
         self.equalities = len(of_blocks)
-        of_blocks += [m.nv + m.geom_bodyid[[a, b]] for a, b in self.scene.geom_pairs]
+        of_blocks += [m.nv + m.geom_bodyid[[a, b]] for a, b in self.touching]
         self.sums = torch.zeros(len(of_blocks), m.nv + 2 * m.nbody).double()
         for row, weights in zip(self.sums, of_blocks, strict=True):
             row[weights] = 1.0
@@ -196,7 +198,7 @@ class _Robot:
         of_rows = self.sums @ torch.cat((of_dofs, *of_bodies))
         weights = torch.cat((of_bodies[0][self.contact_body], of_rows)).clamp(min=LEAST_WEIGHT)
         rough = values["friction"][self.friction_geoms].amax(1).clamp(min=LEAST_FRICTION) * self.has_friction
-        ground, between = rough.split((len(self.contact_body), len(self.scene.geom_pairs)))
+        ground, between = rough.split((len(self.contact_body), len(self.touching)))
         friction = torch.cat((ground, ground.new_zeros(self.equalities), between))
         return of_dofs.log(), torch.stack((friction, weights.log()), 1)
 

@@ -345,7 +345,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
             "motor": T,  # force of the joint's motors
             "unclamped": T,  # 1 where the actuators' force is within its bounds
         }
-    add_constraints(structs, spec, T, vec3, vec6, mat3, mat6)
+    add_constraints(structs, spec, T, vec3, vec4, vec6, mat3, mat6)
     kinds |= {name: struct(name, members) for name, members in structs.items()}
     return SimpleNamespace(
         **kinds,

@@ -14,6 +14,7 @@ from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lane import K_D, K_N, MU
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.pair_geometry import pair_geometry
+from diffsim.kernels.pair_list import pair_list
 from diffsim.kernels.pair_solver import row_solver
 from diffsim.kernels.pairs import pair_rows
 from diffsim.kernels.spatial import spatial
@@ -29,7 +30,7 @@ SMALLEST = 1e-12  # of a violation whose direction is defined
 def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     """Make the rows' part of the adjoint."""
     t, block, kin, geometry = types(spec), blocks(spec), kinematics(spec), pair_geometry(spec)
-    rows, solver, sp = pair_rows(spec), row_solver(spec, "Nodes"), spatial(spec)
+    rows, listed, solver, sp = pair_rows(spec), pair_list(spec), row_solver(spec, "Nodes"), spatial(spec)
     T, vec3, vec6, pick, join, force_at = t.T, t.vec3, t.vec6, block.pick, sp.join, sp.force_at
     Model, Lane, Ck, Links, Contacts, Nodes, Adjoints, Array = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Nodes Adjoints Ts".split()
@@ -44,8 +45,8 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def recall(m: Model, here: Lane, links: Links, origin: vec3, ck: Ck, contacts: Contacts):
         """Place the blocks as they were in a substep, with the jar that it ended with; returns their end."""
-        rows.place_world(links, origin)
-        end = rows.list_blocks(m, here, links, contacts)
+        listed.place_world(links, origin)
+        end = listed.list_blocks(m, here, links, contacts)
         for c in range(here.begin, end):
             s = contacts[c].row
             D, rest = rows.rest_of(m, here, c, links, contacts)
@@ -236,7 +237,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
         g_turn = wp.cross(g, contacts[c].jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, rate)
         g_p = add_end_adjoint(i, contacts[c].p, b, -(E * g), -(E * f), links, nodes, adj)
         g_p = g_p + add_end_adjoint(j, contacts[c].p, b, E * g, E * f, links, nodes, adj)
-        first, second = geometry.geoms_adjoint(m, s, links, g_p, g_r, g_turn)
+        first, second = listed.contact_adjoint(m, c, links, contacts, g_p, g_r, g_turn)
         adj[i].p = adj[i].p + first
         adj[j].p = adj[j].p + second
 

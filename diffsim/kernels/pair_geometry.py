@@ -37,7 +37,8 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of a block's geometry: its points, frame and violation, and their adjoint."""
     t, sp = types(spec), spatial(spec)
     T, U, vec3, vec6, mat3 = t.T, t.U, t.vec3, t.vec6, t.mat3
-    Model, Links, Contacts, force_at, point_velocity = t.Model, t.Links, t.Contacts, sp.force_at, sp.point_velocity
+    Model, Links, Contacts, Touch, Box = t.Model, t.Links, t.Contacts, t.Touch, t.Box
+    force_at, point_velocity = sp.force_at, sp.point_velocity
     pick = blocks(spec).pick
     JOINTS, POINTS, TURNS = spec.has("joint_rows point_rows turn_rows")
     LEAST_DET = PARALLEL[int(t.U == wp.float32)]
@@ -166,21 +167,82 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return first, second
 
     @wp.func
+    def less(a: T, b: T):
+        """Return 1 where a < b, else 0."""
+        return pick(a, b, T(1.0), T(0.0))
+
+    @wp.func
+    def sign(x: T):
+        """Return -1 where x < 0, else 1."""
+        return pick(x, T(0.0), T(-1.0), T(1.0))
+
+    @wp.func
+    def signs(v: vec3):
+        return vec3(sign(v[0]), sign(v[1]), sign(v[2]))
+
+    @wp.func
+    def shifted(v: vec3):
+        """Return the marks v of axes moved on to the following ones."""
+        return vec3(v[2], v[0], v[1])
+
+    @wp.func
+    def largest(v: vec3):
+        """Mark the axis of the largest number, the first of equal ones."""
+        first = (T(1.0) - less(v[0], v[1])) * (T(1.0) - less(v[0], v[2]))
+        second = (T(1.0) - first) * (T(1.0) - less(v[1], v[2]))
+        return vec3(first, second, T(1.0) - first - second)
+
+    @wp.func
+    def blend(which: T, a: vec3, b: vec3):
+        """Return a where which is 1, b where it is 0."""
+        return vec3(pick(T(0.5), which, a[0], b[0]), pick(T(0.5), which, a[1], b[1]), pick(T(0.5), which, a[2], b[2]))
+
+    @wp.func
+    def blend_wrenches(which: T, a: vec6, b: vec6):
+        """Return a where which is 1, b where it is 0, whatever the other one is."""
+        result = b
+        for k in range(6):
+            result[k] = pick(T(0.5), which, a[k], b[k])
+        return result
+
+    @wp.func
     def has_box(m: Model, s: int):
         return m.row_shape[s][9] > U(0.0)
 
     @wp.func
     def segments(m: Model, s: int, links: Links):
-        """Return the centres and the half axes of two geoms: x_1, a_1, x_2, a_2, which is 0 of a box."""
+        """Return two geoms with their centres and half axes."""
         c = m.row_shape[s]
         i = m.row_link[2 * s]
         j = m.row_link[2 * s + 1]
-        x1 = sp.on_link(links[i].R, links[i].x, m.row_first[s])
-        x2 = sp.on_link(links[j].R, links[j].x, m.row_second[s])
-        a2 = links[j].R * vec3(T(c[6]), T(c[7]), T(c[8]))
+        touch = Touch()
+        touch.x1 = sp.on_link(links[i].R, links[i].x, m.row_first[s])
+        touch.x2 = sp.on_link(links[j].R, links[j].x, m.row_second[s])
+        touch.a1 = links[i].R * vec3(T(c[3]), T(c[4]), T(c[5]))
+        touch.a2 = links[j].R * vec3(T(c[6]), T(c[7]), T(c[8]))
         if has_box(m, s):
-            a2 = vec3()
-        return x1, links[i].R * vec3(T(c[3]), T(c[4]), T(c[5])), x2, a2
+            touch.a2 = vec3()
+        touch.side = T(1.0)
+        return touch
+
+    @wp.func
+    def second_box(m: Model, s: int, links: Links):
+        """Return the box that is the second of two geoms."""
+        c = m.row_shape[s]
+        j = m.row_link[2 * s + 1]
+        box = Box()
+        box.x = sp.on_link(links[j].R, links[j].x, m.row_second[s])
+        box.R = links[j].R * mat3(m.row_second_frame[s])
+        box.h = vec3(T(c[6]), T(c[7]), T(c[8]))
+        return box
+
+    @wp.func
+    def reaches(centre: vec3, reach: T, box: Box):
+        """Return more than 0 where a sphere touches a box, however large that is."""
+        gap = wp.abs(wp.transpose(box.R) * (centre - box.x)) - box.h
+        for k in range(3):
+            gap[k] = wp.max(gap[k], T(0.0))
+        return reach * reach - wp.dot(gap, gap)
 
     @wp.func
     def box_point(m: Model, s: int, links: Links, from_centre: vec3):
@@ -224,15 +286,30 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def nearest_points(m: Model, s: int, links: Links):
-        """Return segments and nearest of two geoms, and -1 inside a box, else 1."""
-        x1, a1, x2, a2 = segments(m, s, links)
-        s1, s2, d = nearest(x1, a1, x2, a2)
+        """Return two geoms with their nearest points."""
+        touch = segments(m, s, links)
+        s1, s2, d = nearest(touch.x1, touch.a1, touch.x2, touch.a2)
         side = T(1.0)
         if has_box(m, s):
-            point, free, R, found = box_point(m, s, links, x1 - x2)
-            d = point - (x1 - x2)
+            point, free, R, found = box_point(m, s, links, touch.x1 - touch.x2)
+            d = point - (touch.x1 - touch.x2)
             side = found
-        return x1, a1, x2, a2, s1, s2, d, side
+        touch.s1 = s1
+        touch.s2 = s2
+        touch.d = d
+        touch.side = side
+        return touch
+
+    @wp.func
+    def to_box(m: Model, s: int, links: Links, centre: vec3, x2: vec3):
+        """Return a sphere and a box with their nearest points."""
+        point, free, R, side = box_point(m, s, links, centre - x2)
+        touch = Touch()
+        touch.x1 = centre
+        touch.x2 = x2
+        touch.d = point - (centre - x2)
+        touch.side = side
+        return touch
 
     @wp.func
     def contact_frame(d: vec3):
@@ -252,37 +329,45 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return E, length, along, size
 
     @wp.func
-    def place_geoms(m: Model, c: int, links: Links, contacts: Contacts):
-        """Set point, frame, violation and activity of two geoms' block; returns 1 within the margin, else 0."""
-        s = contacts[c].row
-        r1 = T(m.row_shape[s][1])
-        r2 = T(m.row_shape[s][2])
-        x1, a1, x2, a2, s1, s2, d, side = nearest_points(m, s, links)
-        E, length, along, size = contact_frame(side * d)
-        n = vec3(E[0, 2], E[1, 2], E[2, 2])
-        contacts[c].E = E
-        contacts[c].p = x1 + s1 * a1 + T(0.5) * (d + (r1 - r2) * n)
-        contacts[c].q = contacts[c].p
-        contacts[c].r = side * length - r1 - r2 - T(m.row_params[s][10])
-        contacts[c].active = pick(contacts[c].r, T(0.0), T(1.0), T(0.0))
-        return contacts[c].active
+    def normal_adjoint(E: mat3, along: T, size: T, g_turn: vec3):
+        """Return the adjoint of a contact's normal by that of a rotation of its frame, in the frame."""
+        return E * vec3(g_turn[1], -g_turn[0] - along / size * g_turn[2], T(0.0))
 
     @wp.func
-    def geoms_adjoint(m: Model, s: int, links: Links, g_p: vec3, g_r: T, g_turn: vec3):
-        """Return the adjoints of both links' poses, as wrenches.
+    def set_normal(c: int, n: vec3, which: T, contacts: Contacts):
+        """Give a contact the frame with the normal n, where `which` is 1."""
+        E, length, along, size = contact_frame(n)
+        for i in range(3):
+            for j in range(3):
+                contacts[c].E[i, j] = pick(T(0.5), which, E[i, j], contacts[c].E[i, j])
 
-        Those of the point are g_p, of the distance g_r, of a rotation of the frame, in the frame, g_turn.
-        """
-        x1, a1, x2, a2, s1, s2, d, side = nearest_points(m, s, links)
-        E, length, along, size = contact_frame(side * d)
+    @wp.func
+    def normal_of(c: int, contacts: Contacts, g_turn: vec3):
+        """Return a contact's normal, and its adjoint by that of a rotation of the frame, in the frame."""
+        frame = contacts[c].E
+        n = vec3(frame[0, 2], frame[1, 2], frame[2, 2])
+        E, length, along, size = contact_frame(n)
+        return n, normal_adjoint(E, along, size, g_turn)
+
+    @wp.func
+    def place_touch(m: Model, s: int, c: int, touch: Touch, contacts: Contacts):
+        """Set point, frame, violation and activity of block c for the row s."""
+        r1 = T(m.row_shape[s][1])
+        r2 = T(m.row_shape[s][2])
+        E, length, along, size = contact_frame(touch.side * touch.d)
         n = vec3(E[0, 2], E[1, 2], E[2, 2])
-        half = T(0.5) * T(m.row_shape[s][1] - m.row_shape[s][2])
-        g_n = E * vec3(g_turn[1], -g_turn[0] - along / size * g_turn[2], T(0.0)) + half * (g_p - wp.dot(g_p, n) * n)
-        g_d = pick(T(TINY), length, side / length, T(0.0)) * g_n + g_r * n
-        g1 = T(0.5) * g_p - g_d
-        g2 = T(0.5) * g_p + g_d
-        free1 = pick(wp.abs(s1), T(1.0), pick(T(0.0), wp.dot(a1, a1), T(1.0), T(0.0)), T(0.0))
-        free2 = pick(wp.abs(s2), T(1.0), pick(T(0.0), wp.dot(a2, a2), T(1.0), T(0.0)), T(0.0))
+        contacts[c].E = E
+        contacts[c].p = touch.x1 + touch.s1 * touch.a1 + T(0.5) * (touch.d + (r1 - r2) * n)
+        contacts[c].q = contacts[c].p
+        contacts[c].r = touch.side * length - r1 - r2 - T(m.row_params[s][10])
+        contacts[c].active = pick(contacts[c].r, T(0.0), T(1.0), T(0.0))
+
+    @wp.func
+    def slide_adjoint(z1: vec3, d: vec3, a1: vec3, a2: vec3, free1: T, free2: T, g1: vec3, g2: vec3):
+        """Return the adjoints of both links' poses, as wrenches, of those of two nearest points, z_1 and z_1 + d.
+
+        A point is free, 1, to move along its segment with half axis a, or not, 0.
+        """
         ma = pick(T(0.0), free1, wp.dot(a1, a1), T(1.0))
         mb = free1 * free2 * wp.dot(a1, a2)
         mc = pick(T(0.0), free2, wp.dot(a2, a2), T(1.0))
@@ -291,12 +376,28 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         inv_det = T(1.0) / wp.max(ma * mc - mb * mb, T(LEAST_DET) * ma * mc)
         m1 = free1 * (mc * q1 + mb * q2) * inv_det
         m2 = -free2 * (mb * q1 + ma * q2) * inv_det
-        g1 = g1 - m1 * a1 - m2 * a2
-        g2 = g2 + m1 * a1 + m2 * a2
-        first = force_at(x1 + s1 * a1, g1) + sp.join(m1 * wp.cross(a1, d), vec3())
-        second = force_at(x1 + s1 * a1 + d, g2) + sp.join(m2 * wp.cross(a2, d), vec3())
+        first = force_at(z1, g1 - m1 * a1 - m2 * a2) + sp.join(m1 * wp.cross(a1, d), vec3())
+        second = force_at(z1 + d, g2 + m1 * a1 + m2 * a2) + sp.join(m2 * wp.cross(a2, d), vec3())
+        return first, second
+
+    @wp.func
+    def touch_adjoint(m: Model, s: int, links: Links, touch: Touch, g_p: vec3, g_r: T, g_turn: vec3):
+        """Return the adjoints of both links' poses, as wrenches, where two geoms touch.
+
+        Those of the point are g_p, of the distance g_r, of a rotation of the frame, in the frame, g_turn.
+        """
+        x1, a1, a2, d = touch.x1, touch.a1, touch.a2, touch.d
+        E, length, along, size = contact_frame(touch.side * d)
+        n = vec3(E[0, 2], E[1, 2], E[2, 2])
+        half = T(0.5) * T(m.row_shape[s][1] - m.row_shape[s][2])
+        g_n = normal_adjoint(E, along, size, g_turn) + half * (g_p - wp.dot(g_p, n) * n)
+        g_d = pick(T(TINY), length, touch.side / length, T(0.0)) * g_n + g_r * n
+        g2 = T(0.5) * g_p + g_d
+        free1 = pick(wp.abs(touch.s1), T(1.0), pick(T(0.0), wp.dot(a1, a1), T(1.0), T(0.0)), T(0.0))
+        free2 = pick(wp.abs(touch.s2), T(1.0), pick(T(0.0), wp.dot(a2, a2), T(1.0), T(0.0)), T(0.0))
+        first, second = slide_adjoint(x1 + touch.s1 * a1, d, a1, a2, free1, free2, T(0.5) * g_p - g_d, g2)
         if has_box(m, s):
-            point, free, R, found = box_point(m, s, links, x1 - x2)
+            point, free, R, found = box_point(m, s, links, x1 - touch.x2)
             followed = force_at(x1, R * wp.cw_mul(free, wp.transpose(R) * g2))
             first = first + followed
             second = second - followed

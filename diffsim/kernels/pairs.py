@@ -19,6 +19,7 @@ from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.pair_geometry import pair_geometry
+from diffsim.kernels.pair_list import pair_list
 from diffsim.kernels.pair_solver import row_solver
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -26,7 +27,6 @@ from diffsim.kernels.wide import blocks
 from diffsim.robot.pairs import GEOMS, JOINT
 
 ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterate's, in the norm of T^-1
-UNSOLVED = 1e8  # square of the acceleration by which a step is wrong that lacks a contact for want of room
 
 
 @cache
@@ -38,18 +38,11 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     Model, Lane, Ck, Links, Contacts, Motions, Loads, Root, Newton = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Motions Loads Root Newton".split()
     )
-    FLOATING, VARIED, PAIRS, WORLD = spec.floating, spec.varied, spec.pairs, spec.room - 1
-    EQUALITIES, NPOINTS, LAST = spec.pair_sizes.equalities, spec.pair_sizes.points, spec.pair_sizes.blocks - 1
+    FLOATING, VARIED, WORLD = spec.floating, spec.varied, spec.room - 1
+    listed, LAST = pair_list(spec), spec.pair_sizes.last
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
     COLUMN = 2 * spec.nv + 3 * spec.spheres  # of jar in the checkpoint
     JOINTS, TOUCH = spec.has("joint_rows geoms_rows")
-
-    @wp.func
-    def place_world(links: Links, origin: vec3):
-        """Place the world, beside a floating base about which all else is."""
-        if wp.static(FLOATING):
-            links[WORLD].R = wp.identity(3, dtype=T)
-            links[WORLD].x = -origin
 
     @wp.func
     def equality_state(m: Model, s: int, r: vec3):
@@ -106,39 +99,6 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         return vec4(D, state[1], state[2], state[3])
 
     @wp.func
-    def list_blocks(m: Model, here: Lane, links: Links, contacts: Contacts):
-        """List and place the blocks that act, of equality all, of geoms those near each other; returns their end.
-
-        The element after the last one has a D if there is no room for all.
-        """
-        end = here.begin
-        last = here.begin + LAST
-        contacts[last].D = T(0.0)
-        equalities = int(EQUALITIES)  # not unrolled
-        pairs = int(PAIRS)
-        points = int(NPOINTS)
-        for s in range(equalities):
-            contacts[end].row = s
-            geometry.place(m, end, links, contacts)
-            end = end + 1
-        if wp.static(TOUCH):
-            centres = wp.zeros(shape=NPOINTS, dtype=vec3)
-            for k in range(points):
-                i = m.point_link[k]
-                centres[k] = sp.on_link(links[i].R, links[i].x, m.point[k])
-            for s in range(equalities, pairs):
-                d = centres[m.row_points[2 * s + 1]] - centres[m.row_points[2 * s]]
-                if block.any_of(T(m.row_shape[s][0]) - wp.dot(d, d)):  # of their bounding spheres
-                    contacts[end].row = s
-                    active = geometry.place_geoms(m, end, links, contacts)
-                    if block.any_of(active):
-                        if end < last:
-                            end = end + 1
-                        else:
-                            contacts[last].D = contacts[last].D + T(UNSOLVED) * active
-        return end
-
-    @wp.func
     def rest_of(m: Model, here: Lane, c: int, links: Links, contacts: Contacts):
         """Return D of a block, and jar without velocity and acceleration."""
         s = contacts[c].row
@@ -158,10 +118,10 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def begin(m: Model, here: Lane, links: Links, motions: Motions, origin: vec3, contacts: Contacts):
         """Set up the blocks at the start of a substep, with zero acceleration; returns their end."""
-        place_world(links, origin)
+        listed.place_world(links, origin)
         motions[WORLD].accel_link = join(vec3(), -vec3(m.gravity))
         solver.clear(motions)
-        end = list_blocks(m, here, links, contacts)
+        end = listed.list_blocks(m, here, links, contacts)
         for c in range(here.begin, end):
             s = contacts[c].row
             i = m.row_link[2 * s]

@@ -56,7 +56,14 @@ def slots_of(entries: Any, link: np.ndarray) -> np.ndarray:
 
 
 def add_constraints(
-    structs: dict[str, dict[str, Any]], spec: KernelSpec, T: type, vec3: type, vec6: type, mat3: type, mat6: type
+    structs: dict[str, dict[str, Any]],
+    spec: KernelSpec,
+    T: type,
+    vec3: type,
+    vec4: type,
+    vec6: type,
+    mat3: type,
+    mat6: type,
 ) -> None:
     """Add the constraints' own structs, and the members that other ones have with them, by their names and types."""
     structs |= {
@@ -127,7 +134,33 @@ def add_constraints(
             "begin": int,  # the first block's element of contacts
             "end": int,  # the element after the last block that acts in the substep
         }
+        if spec.pair_sizes.most > 1:
+            structs["Contact"] |= {  # see capsule_contacts.py and box_contacts.py
+                # a corner of a clipped face, the point on the edge of the first box, or that on a capsule's axis, s
+                "vertex": vec3,
+                "a": vec3,  # of a corner; half the edge of the first box; ds/dy
+                "b": vec3,  # of a corner; half the edge of the second box; ds/dh
+                # Of parallel capsules s_1 and s_2. Of two boxes: 1 for two edges; 1 for a face of the first box;
+                # `kept` of a corner, or 1 where the first edge's point is free to move; 1 where the second one's is
+                "how": vec4,
+            }
     if spec.branched:
+        # Two geoms and their nearest points: x + s a of a sphere or a capsule's axis, or one of a box
+        structs["Touch"] = {
+            "x1": vec3,  # centre of the first geom
+            "a1": vec3,  # half its axis, 0 of a sphere
+            "x2": vec3,
+            "a2": vec3,  # 0 of a box, too
+            "s1": T,
+            "s2": T,
+            "d": vec3,  # from the first point to the second
+            "side": T,  # -1 if the first is inside a box, else 1
+        }
+        structs["Box"] = {
+            "x": vec3,  # centre
+            "R": mat3,  # axes
+            "h": vec3,  # half lengths
+        }
         work = {
             "twist": vec6,  # of the link, by the forces of rows between bodies; in the inward sweep the bias force
             "rate": T,  # of its joint

@@ -20,8 +20,19 @@ Touch = Callable[[int, int], Array]  # two geoms
 JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs.py
 NAMES = "joint", "point", "turn", "geoms"
 _Geom = mujoco.mjtGeom
-SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "BOX", "MESH")]  # made capsules
-MOST_PAIRS = 64  # of geoms that touch at once, in the environments that a thread steps together
+SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "MESH")]  # made capsules
+# Kinds of two geoms: parallel capsules, spheres and capsules, a sphere and a box, a capsule and a box, two boxes
+PARALLEL, SEGMENTS, BALL_BOX, CAPSULE_BOX, BOXES = range(-1, 4)
+CONTACTS = {PARALLEL: 2, SEGMENTS: 1, BALL_BOX: 1, CAPSULE_BOX: 2, BOXES: 8}  # at most, of a pair
+KINDS = {
+    (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CAPSULE): PARALLEL,  # SEGMENTS if they are not parallel
+    (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_BOX): BALL_BOX,
+    (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_BOX): CAPSULE_BOX,
+    (_Geom.mjGEOM_BOX, _Geom.mjGEOM_BOX): BOXES,
+}
+FEATURES = {PARALLEL: "parallel_geoms", CAPSULE_BOX: "capsule_box_geoms", BOXES: "box_geoms"}
+STRAIGHT = 1e-4  # sine between two capsules that are parallel
+MOST_PAIRS = 64  # contacts at once, in the environments that a thread steps together
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
 
 
@@ -29,8 +40,15 @@ class PairSizes(NamedTuple):
     """Sizes that the kernels' code depends on."""
 
     equalities: int = 0  # number of blocks of equality, which come first
+    heads: int = 0  # number of these and of the first ones of two geoms, which come next
+    most: int = 1  # contacts of two geoms, at most
     points: int = 0  # number of points of blocks
-    blocks: int = 0  # number of blocks in local arrays, of which the last one has no use
+    blocks: int = 0  # number of blocks in local arrays, of which the last ones are room for those of two geoms
+
+    @property
+    def last(self) -> int:
+        """Return the first element of that room."""
+        return self.blocks - self.most
 
 
 class Pairs(NamedTuple):
@@ -38,11 +56,11 @@ class Pairs(NamedTuple):
 
     kind: Index  # (n,)
     link: Index  # (n, 2) first and second link, -1 for the world beside a floating base
-    partner: Index  # (n,) the other block of a weld, or itself
+    partner: Index  # (n,) the other block of a weld, the second one of two geoms, or itself
     params: Array  # (n, 11) as Constraints.contact
     # (n, 11) of a joint: q_0 of the second and of the first, five coefficients; of a turn: its scale; of two geoms: the
-    # square of the distance where they may touch, radii, half axes in their links' frames or a box's half lengths, and
-    # 1 if the second is a box
+    # square of the distance where they may touch, radii, half axes in their links' frames or a box's half lengths,
+    # their kind, and how many contacts they may have, or 0 in all blocks but the first
     shape: Array
     first: Array  # (n, 3) m
     second: Array  # (n, 3) m
@@ -52,7 +70,16 @@ class Pairs(NamedTuple):
     @property
     def features(self) -> frozenset[str]:
         """Return the names of the kinds that are there, for Scene.features."""
-        return frozenset(f"{NAMES[kind]}_rows" for kind in self.kind.tolist())
+        kinds = set(self.shape[self.kind == GEOMS, 9].tolist())
+        rows = frozenset(f"{NAMES[kind]}_rows" for kind in self.kind.tolist())
+        return rows | {name for kind, name in FEATURES.items() if kind in kinds}
+
+    @property
+    def geom_pairs(self) -> NDArray[np.int64]:
+        """Return which pair of geoms each block is of that belongs to one."""
+        contacts = self.shape[self.kind == GEOMS, 10].astype(int)
+        heads = np.arange(len(contacts[contacts > 0]))
+        return np.r_[heads, heads.repeat(contacts[contacts > 0] - 1)]
 
     @property
     def points(self) -> tuple[Array, NDArray[np.int64]]:
@@ -64,8 +91,10 @@ class Pairs(NamedTuple):
     @property
     def sizes(self) -> PairSizes:
         """Return sizes of the kernels' arrays."""
-        equalities = int((self.kind != GEOMS).sum())
-        return PairSizes(equalities, len(self.points[0]), min(len(self.kind), equalities + MOST_PAIRS) + 1)
+        equalities, number = int((self.kind != GEOMS).sum()), len(self.kind)
+        contacts = self.shape[equalities:, 10]
+        heads, most = equalities + int((contacts > 0).sum()), int(contacts.max(initial=1))
+        return PairSizes(equalities, heads, most, len(self.points[0]), min(number, equalities + MOST_PAIRS) + most)
 
 
 class _Rows:
@@ -106,23 +135,32 @@ class _Rows:
         )
         link = np.stack(links, 1).astype(np.int32)
         kinds, partners = (np.array(each, np.int32) for each in (kind, partner))
-        return Pairs(kinds, link, partners, np.array(params), np.array(shape), *points, *frames)
+        heads = Pairs(kinds, link, partners, np.array(params), np.array(shape), *points, *frames)
+        further = np.where(kinds == GEOMS, heads.shape[:, 10] - 1, 0).astype(int)  # contacts, which come at the end
+        number, order = len(kinds), np.r_[np.arange(len(kinds)), np.repeat(np.arange(len(kinds)), further)]
+        partners[further > 0] = number + (further.cumsum() - further)[further > 0]
+        pairs = Pairs._make(values[order] for values in heads)
+        pairs.partner[number:], pairs.shape[number:, 10] = np.arange(number, len(order)), 0
+        return pairs
 
     def add_geoms(self, a: int, b: int, params: Array) -> None:
         """Append the block of two geoms."""
-        boxed = is_exact(self.m, a, b) and _Geom.mjGEOM_BOX in self.m.geom_type[[a, b]]
-        m, data = (self.m, self.data) if boxed else self.capsules
-        ends, axes, reach = list[Frame](), list[Array](), params[10]
+        (m, data), reach = self.capsules, params[10]
         geoms = sorted((a, b), key=lambda geom: int(m.geom_type[geom]))  # MuJoCo's order: a sphere comes first
+        ends, sizes, radii = list[Frame](), list[Array](), list[float]()
         for geom in geoms:
-            end = self.frame(m.geom_bodyid[geom], data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))
-            half = m.geom_size[geom, 1] * (m.geom_type[geom] == _Geom.mjGEOM_CAPSULE)
+            kind, size, turn = m.geom_type[geom], m.geom_size[geom], data.geom_xmat[geom].reshape(3, 3)
+            end, boxed = self.frame(m.geom_bodyid[geom], data.geom_xpos[geom], turn), kind == _Geom.mjGEOM_BOX
             ends.append(end)
-            axes.append(half * end[2][:, 2])
+            radii.append(0.0 if boxed else size[0])
+            sizes.append(size if boxed else size[1] * (kind == _Geom.mjGEOM_CAPSULE) * end[2][:, 2])
             reach += m.geom_rbound[geom]
-        radii, (first, second) = m.geom_size[geoms, 0] * (1.0, 1.0 - boxed), axes
-        second = m.geom_size[geoms[1]] if boxed else second
-        shape = max(reach, 0.0) ** 2, *radii, *first, *second, float(boxed)
+        first, second = (_Geom(int(m.geom_type[geom])) for geom in geoms)
+        touch = KINDS.get((first, second), SEGMENTS)
+        one, other = data.geom_xmat[geoms, 2::3]  # their z axes
+        if touch == PARALLEL and np.linalg.norm(np.cross(one, other)) > STRAIGHT:
+            touch = SEGMENTS
+        shape = max(reach, 0.0) ** 2, *radii, *sizes[0], *sizes[1], touch, CONTACTS[touch]
         self.add(GEOMS, ends[0], ends[1], params, 0, shape)
 
     def add_equality(self, k: int, row: Row) -> None:
@@ -199,12 +237,11 @@ def rough_obstacles(m: mujoco.MjModel) -> NDArray[np.bool_]:
 
 def is_exact(m: mujoco.MjModel, a: int, b: int) -> bool:
     """Tell whether two geoms touch each other in their own shapes."""
-    kinds = {_Geom(int(m.geom_type[geom])) for geom in (a, b)}
-    return kinds <= {_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE} or kinds == {_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_BOX}
+    return not np.isin(m.geom_type[[a, b]], SHAPES).any()
 
 
 def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
-    """Return a copy whose geoms have the shapes that touch each other here: spheres, and capsules in place of the rest.
+    """Return a copy whose geoms have the shapes that touch each other here: capsules in place of SHAPES.
 
     A capsule has the length of its geom's bounding box, and its mean width.
     """
@@ -228,7 +265,7 @@ def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
 def with_pairs(scene: Scene) -> Scene:
     """Return a copy whose parts touch each other and fixed geoms as the file lets them, on MuJoCo's contact.
 
-    Shapes other than spheres are capsules, see `as_capsules`, except boxes that touch spheres. A pair is left out whose
+    Capsules stand for other shapes than spheres, capsules and boxes, see `as_capsules`. A pair is left out whose
     capsules overlap in the first keyframe, or the reference pose, though the file's shapes do not.
 
     Raises:

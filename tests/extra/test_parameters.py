@@ -26,7 +26,7 @@ from scenes import (
 )
 from test_constraint import PASSES, SLOW, H, in_mujoco, mujoco_model, step, tree_states
 from test_gradient import measure, weights
-from test_pairs import model_as_it_is, tangled, tied_states, tied_tree
+from test_pairs import model_as_it_is, solid_states, solids, tangled, tied_states, tied_tree
 from torch import Tensor
 
 from diffsim.extra.parameters import FIELDS, ParametricSimulator
@@ -110,9 +110,17 @@ def tied() -> tuple[Scene, Any]:
     return scene, calm(scene, states, np.full(96, True))
 
 
-def touching(cone: str) -> tuple[Scene, Any]:
-    """Two robots whose parts touch in half of the states, with a declared pair, exclusions and a connect."""
-    scene, states = tangled("objects", cone, 0, 96, np.random.default_rng(0))
+def touching(shapes: str, cone: str) -> tuple[Scene, Any]:
+    """Two robots whose parts touch in half of the states, or boxes and capsules with several contacts of a pair.
+
+    The robots have a declared pair, exclusions and a connect.
+    """
+    rng = np.random.default_rng(0)
+    if shapes == "robots":
+        scene, states = tangled("objects", cone, 0, 96, rng)
+    else:
+        scene = solids(cone, 0)
+        states = solid_states(scene, 96, rng)
     ends, apart = (step(each, states)[1] for each in (scene, dataclasses.replace(scene, geom_pairs=())))
     touch = abs(ends - apart).max(1) > 1e-3
     return scene, [np.concatenate(x) for x in zip(calm(scene, states, touch), calm(scene, states, ~touch), strict=True)]
@@ -136,9 +144,11 @@ CASES = {
     "soft": (soft_tree, SOFT),
     "ball on the world": (shoulder, HARD),
     "tied": (tied, HARD),
-    "touching": (lambda: touching("elliptic"), HARD),
-    "touching pyramids": (lambda: touching("pyramidal"), HARD),
+    "touching": (lambda: touching("robots", "elliptic"), HARD),
+    "touching pyramids": (lambda: touching("robots", "pyramidal"), HARD),
+    "touching solids": (lambda: touching("solids", "elliptic"), HARD),
 }
+TOUCHING = "touching", "touching pyramids", "touching solids"
 QUICK = "floating", "ball", "Euler's servos", "soft", "touching"
 
 
@@ -190,7 +200,7 @@ def test_gradients_are_those_of_rebuilt_models(name: str, rng: np.random.Generat
     assert {"friction"} <= tested if two else {"armature", "gain"} <= tested
 
 
-STEPPED = "floating", "pyramids", "ball", "Euler's servos", "bounded servos", "tied", "touching", "touching pyramids"
+STEPPED = "floating", "pyramids", "ball", "Euler's servos", "bounded servos", "tied", *TOUCHING
 
 
 @pytest.mark.parametrize("name", cases(*STEPPED))
