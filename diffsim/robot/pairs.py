@@ -230,9 +230,9 @@ def obstacle_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def rough_obstacles(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Mark fixed geoms (ngeom,) that something would touch in other shapes than the file's."""
-    rough = [pair for pair in obstacle_pairs(m) if not is_exact(m, *pair)]
-    return np.isin(range(m.ngeom), rough) & (m.body_weldid[m.geom_bodyid] == 0)
+    """Mark fixed geoms (ngeom,) that others would touch in another shape than the file's."""
+    touched = np.isin(range(m.ngeom), obstacle_pairs(m)) & (m.body_weldid[m.geom_bodyid] == 0)
+    return touched & np.isin(m.geom_type, SHAPES)
 
 
 def is_exact(m: mujoco.MjModel, a: int, b: int) -> bool:

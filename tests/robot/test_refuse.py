@@ -103,7 +103,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "geom 'rock': contact is simulated with one ground plane only; set contype and conaffinity to 0 if only drawn": (
         pendulum(world='<geom name="rock" type="hfield" hfield="h"/>', rest=HILLS)
     ),
-    "geom 'rock': fixed geoms are spheres, capsules or boxes, and touch no others; set contype": [
+    "geom 'rock': fixed geoms that touch others are spheres, capsules or boxes here; set contype": [
         pendulum(world='<geom name="rock" type="cylinder" size="1 1 1"/>'),
         pendulum(world='<body><geom name="rock" type="mesh" mesh="m"/></body>', rest=f"<asset>{TETRAHEDRON}</asset>"),
     ],
