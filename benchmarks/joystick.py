@@ -10,7 +10,8 @@ at 0.5 m/s forward; the change of actions that of all commands.
 
 Writes joystick.csv, a row for each policy and world, and with --update-results the tables of docs/joystick.md; with
 --race joystick_race.csv, of checkpoints that were copied beside their run's progress.csv while it trained; with
---rough joystick_rough.csv, of ground of boxes, the same for all policies, on which each command starts elsewhere.
+--rough joystick_rough.csv, of ground of boxes, the same for all policies, on which each command starts elsewhere; with
+--own joystick_own.csv.
 """
 
 from __future__ import annotations
@@ -231,6 +232,9 @@ def rough(rows: list[dict[str, str]]) -> list[Row]:
 
 def main(args: Args) -> None:
     key = (*ABOUT[:-1], "file", "friction", "push", "mass", "gains", "latency")
+    if args.own:
+        measured(args, Part("joystick_own", measure, key))
+        return
     if args.race:
         measured(args, Part("joystick_race", measure, key, "race", PAGE, race))
         return
