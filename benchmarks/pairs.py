@@ -252,7 +252,7 @@ def measure_time(args: Args, name: str) -> Iterator[Row]:
 
 
 SHOWN = ("scene", "rows", "passes", "steps per pass", "adjoint's steps", "MuJoCo's passes", "cold")
-TIMED = ("touching", "pairs", "number", "environments", "forward, relative", "backward, relative")
+TIMED = ("touching", "number", "forward, relative", "backward, relative")
 PARTS = {
     "solver": Part("pairs_solver", measure_solver, ("scene",), "pairs_solver", "physics.md", list, SHOWN),
     "time": Part(

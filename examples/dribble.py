@@ -1,9 +1,9 @@
-"""A Go2 that dribbles a ball to commanded places, and its policy in MuJoCo; docs/own_robot.md explains it.
+"""A Go2 that dribbles a ball to commanded places; docs/own_robot.md.
 
 git clone https://github.com/google-deepmind/mujoco_menagerie
-python rpo.py --env examples/dribble.py --horizon 16 --adjoint-clip 5 --initial-log-std -2 --iterations 600
-python -m diffsim export runs/<run>/checkpoint.pt dribble.onnx --env examples/dribble.py
-python examples/dribble.py dribble.onnx
+python rpo.py --env examples/dribble.py --horizon 16 --adjoint-clip 5 --initial-log-std -2 --num-envs 128 \\
+    --iterations 1600 --critic-hidden 256 128 --critic-lr 1e-3
+python benchmarks/own_tasks.py runs/<run> --own examples/dribble.py --file mujoco_menagerie/unitree_go2/scene.xml
 """
 
 import mujoco

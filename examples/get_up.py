@@ -1,8 +1,8 @@
-"""A G1 that gets up from the ground, and its policy in MuJoCo; docs/own_robot.md explains it.
+"""A G1 that gets up from the ground; docs/own_robot.md.
 
-python rpo.py --env examples/get_up.py --horizon 24 --adjoint-clip 5 --initial-log-std -1.5 --iterations 1000
-python -m diffsim export runs/<run>/checkpoint.pt get_up.onnx --env examples/get_up.py
-python examples/get_up.py get_up.onnx
+python rpo.py --env examples/get_up.py --horizon 16 --adjoint-clip 2 --initial-log-std -1 --num-envs 2048 \\
+    --iterations 800 --actor-hidden 256 256 --critic-hidden 256 256 --critic-lr 1e-3 --device cuda
+python benchmarks/own_tasks.py runs/<run> --own examples/get_up.py --file mujoco_menagerie/unitree_g1/scene.xml
 """
 
 import math
@@ -22,7 +22,7 @@ from diffsim.tasks.base import ASSETS
 from diffsim.tasks.locomotion import rotate
 
 HEIGHT, LOWEST, REACH = 0.755, 0.3, 1.5  # m, of the pelvis, standing and lying at the start; rad, of targets from home
-STIFFNESS, DAMPING = (150.0, 5.0), (50.0, 2.0)  # N m/rad and N m s/rad of legs and waist, of arms
+LEGS, ARMS = (150.0, 5.0), (50.0, 2.0)  # N m/rad and N m s/rad of their servos; the waist has the legs'
 HOME = humanoid().home
 AID = 0.8  # largest share of gravity that an episode is without: robots that are lighter get up earlier in training
 
@@ -51,7 +51,7 @@ class GetUp(Task):
         """Give a G1 softer servos, and the range that they need."""
         for motor, joint, angle in zip(spec.actuators, spec.joints[1:], HOME, strict=True):
             arm = any(part in joint.name for part in ("shoulder", "elbow", "wrist"))
-            stiffness, damping = DAMPING if arm else STIFFNESS
+            stiffness, damping = ARMS if arm else LEGS
             motor.set_to_position(kp=stiffness, kv=damping)
             low, high = joint.range
             motor.ctrlrange = [max(low, angle - REACH), min(high, angle + REACH)]

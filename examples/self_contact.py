@@ -1,7 +1,9 @@
 """A G1 whose legs touch each other in training, so that its reward needs no term for them; docs/own_robot.md.
 
-python rpo.py --env examples/self_contact.py:Whole --horizon 16 --adjoint-clip 5 --initial-log-std -3
-python benchmarks/joystick.py runs/<run> --own examples/self_contact.py:Whole --push 1 --file <Menagerie's scene.xml>
+python rpo.py --env examples/self_contact.py:Whole --horizon 16 --adjoint-clip 5 --initial-log-std -3 \\
+    --num-envs 1024 --iterations 600 --critic-hidden 256 128 --critic-lr 1e-3 --device cuda
+python benchmarks/joystick.py runs/<run> --own examples/self_contact.py:Whole --push 2 \\
+    --file mujoco_menagerie/unitree_g1/scene.xml
 """
 
 from itertools import product

@@ -160,6 +160,7 @@ RULES: dict[str, Callable[[list[float]], float]] = {
     **{"median": median, "mean": mean, "min": min, "max": max, "sum": sum, "count": len},
     "std": pstdev,
     "percent": lambda values: 100 * median(values),
+    "worst": lambda values: 100 * min(values),
     "milli": lambda values: 1000 * median(values),
 }
 

@@ -17,7 +17,7 @@ MADE = "gradients", "joystick", "numerics", "overview", "suites", "tracking", "t
 CASES = [
     *((name, {}) for name in MADE),
     *((name, {"race": True}) for name in ("joystick", "tracking")),
-    ("pairs", {"parts": ("solver",)}),
+    ("pairs", {}),
     ("speed", {"parts": ("iteration",), "output": common.RESULTS / "h100"}),
 ]
 
