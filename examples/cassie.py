@@ -1,4 +1,4 @@
-"""Agility's Cassie, whose legs are closed chains of rods and springs, walks at a commanded speed; docs/own_robot.md.
+"""Agility's Cassie, whose legs are closed chains of rods and springs, walks at a commanded speed; docs/tasks.md.
 
 python rpo.py --env examples/cassie.py --horizon 16 --adjoint-clip 5 --initial-log-std -2 --iterations 200
 python -m diffsim export runs/<run>/checkpoint.pt cassie.onnx --env examples/cassie.py

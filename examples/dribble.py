@@ -1,4 +1,4 @@
-"""A Go2 that dribbles a ball to commanded places; docs/own_robot.md.
+"""A Go2 that dribbles a ball to commanded places; docs/tasks.md.
 
 git clone https://github.com/google-deepmind/mujoco_menagerie
 python rpo.py --env examples/dribble.py --horizon 16 --adjoint-clip 5 --initial-log-std -2 --num-envs 128 \\

@@ -1,4 +1,4 @@
-"""A G1 that gets up from the ground; docs/own_robot.md.
+"""A G1 that gets up from the ground; docs/tasks.md.
 
 python rpo.py --env examples/get_up.py --horizon 16 --adjoint-clip 2 --initial-log-std -1 --num-envs 2048 \\
     --iterations 800 --actor-hidden 256 256 --critic-hidden 256 256 --critic-lr 1e-3 --device cuda

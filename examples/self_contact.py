@@ -1,4 +1,4 @@
-"""A G1 whose legs touch each other in training, so that its reward needs no term for them; docs/own_robot.md.
+"""A G1 whose legs touch each other in training, so that its reward needs no term for them; docs/tasks.md.
 
 python rpo.py --env examples/self_contact.py:Whole --horizon 16 --adjoint-clip 5 --initial-log-std -3 \\
     --num-envs 1024 --iterations 600 --critic-hidden 256 128 --critic-lr 1e-3 --device cuda

@@ -247,8 +247,9 @@ def test_gradient_through_contact_is_that_of_differences(base, cone, rng):
         check_gradients(scene, [x[calm] for x in states], rng)
 
 
+@SLOW
 @needs_drift
-@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
+@pytest.mark.parametrize("cone", CONES)
 def test_factors_act_on_contact_between_bodies(cone, rng):
     """Those of friction and stiffness as in MuJoCo with other constants; gradients are those of differences."""
     scene, states = tangled("objects", cone, 0, 64, rng)
@@ -331,7 +332,8 @@ def test_fixed_geoms_are_touched_as_in_mujoco(cone, rng):
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     states, touched = (qpos, 0.3 * qvel, ctrl), 0
     whole = with_pairs(scene)
-    for each, model in ((scene, apart_from_itself(scene)), (whole, model_as_it_is(scene))):
+    cases = [(scene, apart_from_itself(scene))] + [(whole, model_as_it_is(scene))] * (cone == "pyramidal")
+    for each, model in cases:
         expected, found = in_mujoco(scene, *states, model=model)[1], step(each, states)[1]
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
         touched = (abs(found - step(dataclasses.replace(scene, geom_pairs=()), states)[1]).max(1) > 1e-3).sum()

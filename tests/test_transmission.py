@@ -73,7 +73,7 @@ def test_gradients_are_those_of_differences(name, rng):
 
 
 @pytest.mark.parametrize("implicit", [pytest.param(False, marks=SLOW), True])
-@pytest.mark.parametrize("name", CASES[1:])
+@pytest.mark.parametrize("name", [CASES[1], *(pytest.param(name, marks=SLOW) for name in CASES[2:])])
 def test_gradients_on_soft_contact_are_those_of_differences(name, implicit, rng):
     scene, states = case(name, 16, rng)
     factors = {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))}
@@ -93,7 +93,7 @@ def test_blocks_in_single_precision_are_near(name, rng):
 
 
 @pytest.mark.parametrize("where, value", [(0, np.nan), (1, np.inf), (2, np.nan)])
-@pytest.mark.parametrize("name", ["implicitfast", "drone"])
+@pytest.mark.parametrize("name", ["implicitfast", pytest.param("drone", marks=SLOW)])
 def test_what_is_not_finite_stays_in_its_environment(name, where, value, rng):
     scene, states = case(name, 9, rng)
     sim = Simulator(scene, 9, Integration("mujoco", 4), 4 / 240)

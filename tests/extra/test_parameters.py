@@ -149,7 +149,7 @@ CASES = {
     "touching solids": (lambda: touching("solids", "elliptic"), HARD),
 }
 TOUCHING = "touching", "touching pyramids", "touching solids"
-QUICK = "floating", "ball", "Euler's servos", "soft", "touching"
+QUICK = "floating", "ball", "Euler's servos", "soft"
 
 
 def cases(*names: str) -> list[Any]:
@@ -233,7 +233,7 @@ def test_without_other_values_the_steps_are_those_of_a_simulator() -> None:
 
 
 @pytest.mark.slow  # for its kernels
-@pytest.mark.parametrize("name", ["floating", "touching"])
+@pytest.mark.parametrize("name", ["floating", pytest.param("touching", marks=pytest.mark.slow)])
 def test_gradients_of_blocks_are_those_of_single_robots(name: str) -> None:
     """In float32, where a thread steps several robots, of which some touch nothing; over the steps of a rollout."""
     scene, states = CASES[name][0]()
