@@ -83,12 +83,13 @@ class Dribble(Go2):
         way = F.normalize(place - ball, dim=-1)
         across = torch.stack((-way[..., 1], way[..., 0]), dim=-1)
         off = qpos[..., :2] - ball
+        # The reference gait goes around the ball, then behind it, and pushes when it is in line
         along, side = (off * way).sum(-1, keepdim=True), (off * across).sum(-1, keepdim=True)
         around = torch.sigmoid((along + 0.5 * BEHIND) / 0.05) * ASIDE * torch.sign(side)
         target = (around - side) * across - (BEHIND + along) * way
         lined = torch.exp(-(side / ALIGNED).square()) * torch.sigmoid(-(along + 0.5 * BEHIND) / 0.05)
         speed = (place - ball).norm(dim=-1, keepdim=True).clamp(max=SPEED) * way
-        lead = 2.0 * target + lined * ((2.0 * (BEHIND + along)) * way + speed * (1.0 + 0.25))
+        lead = 2.0 * target + lined * ((2.0 * (BEHIND + along)) * way + 1.25 * speed)
         wanted = self._turned(qpos, torch.stack((lead, way, -off, moving, place - ball, speed), dim=-2))
         command, ahead, there, rolls, left, speed = wanted.unbind(-2)
         command = torch.minimum(torch.maximum(command, -self._most[:2]), self._most[:2])

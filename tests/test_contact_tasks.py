@@ -58,6 +58,7 @@ def test_robots_begin_tilted_as_far_as_drawn_and_lie_in_tests() -> None:
     assert task.achieved(upright, rand[0]) and not task.achieved(qpos, rand).any()
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_the_image_of_a_robot_that_gets_up_moves_like_it() -> None:
     env = diffsim.make(GET_UP, 4, horizon=1, dtype=torch.float64, accuracy="accurate")

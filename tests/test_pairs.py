@@ -27,7 +27,8 @@ from diffsim.sim.simulator import Simulator
 enough_passes = test_constraint.enough_passes
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs
 TANGLED = "floating", "fixed", "objects"
-BASES = ["floating", *(pytest.param(base, marks=SLOW) for base in ("fixed", "planar", "ball"))]
+ROOTS = "floating", "fixed", "planar", "ball"
+BASES = ["floating", *(pytest.param(base, marks=SLOW) for base in ROOTS[1:])]
 VERSION = tuple(map(int, mujoco.__version__.split(".")[:2]))
 # Of which MuJoCo has added dJ/dt v to connect and weld
 needs_drift = pytest.mark.skipif(VERSION < (3, 7), reason="MuJoCo before 3.7 leaves dJ/dt v out of connect and weld")
@@ -70,11 +71,11 @@ def tied_states(scene, number, rng):
 
 
 @needs_drift
-@pytest.mark.parametrize("base", BASES)
-def test_ten_trees_step_as_in_mujoco(base, rng):
+@pytest.mark.parametrize("base, seeds", [("floating", 3), *(pytest.param(base, 10, marks=SLOW) for base in ROOTS)])
+def test_trees_step_as_in_mujoco(base, seeds, rng):
     """Far from where their constraints would be satisfied, in motion."""
     errors = []
-    for seed in range(10):
+    for seed in range(seeds):
         scene = tied_tree(base, seed)
         states = free_states(scene, 8, rng)
         qvel, expected = step(scene, states)[1], in_mujoco(scene, *states)[1]
@@ -92,7 +93,7 @@ def test_tree_gradient_is_that_of_differences(base, rng):
     check_gradients(scene, [x[calm] for x in states], rng)
 
 
-@pytest.mark.parametrize("block", [1, 8])
+@pytest.mark.parametrize("block", [pytest.param(1, marks=SLOW), 8])
 def test_single_precision_is_near(block, rng):
     scene = tied_tree("floating", 0)
     states, w = tied_states(scene, 9, rng), weights(scene, rng)
@@ -217,15 +218,16 @@ def model_as_it_is(scene):
     return m
 
 
-TANGLES = [pytest.param(*each, marks=[SLOW] * (each != ("floating", "elliptic"))) for each in product(TANGLED, CONES)]
+# Each has kernels of its own
+TANGLES = [("floating", "elliptic", 2), *(pytest.param(*each, 10, marks=SLOW) for each in product(TANGLED, CONES))]
 
 
 @needs_drift
-@pytest.mark.parametrize("base, cone", TANGLES)
-def test_ten_robots_that_touch_themselves_step_as_in_mujoco(base, cone, rng):
+@pytest.mark.parametrize("base, cone, seeds", TANGLES)
+def test_robots_that_touch_themselves_step_as_in_mujoco(base, cone, seeds, rng):
     """With friction of both cones and without, margins, mixed and declared parameters, on the ground and tied."""
     errors = []
-    for seed in range(10):
+    for seed in range(seeds):
         scene, states = tangled(base, cone, seed, 16, rng)
         qvel, residual = step(scene, states)[1:]
         expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
@@ -235,10 +237,10 @@ def test_ten_robots_that_touch_themselves_step_as_in_mujoco(base, cone, rng):
     assert "geoms_rows" in constrained(scene, H).features
 
 
-@pytest.mark.parametrize("base, cone", TANGLES)
-def test_gradient_through_contact_is_that_of_differences(base, cone, rng):
+@pytest.mark.parametrize("base, cone, seeds", TANGLES)
+def test_gradient_through_contact_is_that_of_differences(base, cone, seeds, rng):
     """Where nothing is thrown about, as above."""
-    for seed in range(3):
+    for seed in range(min(3, seeds // 2)):
         scene, states = tangled(base, cone, seed, 96, rng)
         ends, apart = (step(each, states, 4)[1] for each in (scene, dataclasses.replace(scene, geom_pairs=())))
         touches = abs(ends - apart).max(1) > 1e-3

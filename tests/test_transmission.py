@@ -54,7 +54,7 @@ def test_steps_are_mujocos(name, rng):
         assert len(zones) == 6
 
 
-@pytest.mark.parametrize("name", CASES[1:])
+@pytest.mark.parametrize("name", [CASES[1], *(pytest.param(name, marks=SLOW) for name in CASES[2:])])
 def test_accelerations_are_mujocos(name, rng):
     """Without ground and constraints, on soft contact."""
     scene, states = case(name, 64, rng)
@@ -80,7 +80,7 @@ def test_gradients_on_soft_contact_are_those_of_differences(name, implicit, rng)
     check_soft_gradients(scene, states, rng, factors, integration=Integration("soft", 8, implicit))
 
 
-@pytest.mark.parametrize("name", ["implicitfast", "drone"])
+@pytest.mark.parametrize("name", ["implicitfast", pytest.param("drone", marks=SLOW)])
 def test_blocks_in_single_precision_are_near(name, rng):
     scene, states = case(name, 9, rng)
     w, found = weights(scene, rng), []
