@@ -16,7 +16,7 @@ from scenes import free_states, parse, pendulum, random_tree, robot
 from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, step
 from test_gradient import gradients, weights
 
-from diffsim.extra.report import approximations
+from diffsim.extra.report import approximations, report
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
 from diffsim.robot.pairs import as_capsules, with_pairs
@@ -344,6 +344,7 @@ def test_fixed_geoms_are_touched_as_in_mujoco(cone, rng):
         expected, found = in_mujoco(scene, *states, model=model)[1], step(each, states)[1]
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
         touched = (abs(found - step(dataclasses.replace(scene, geom_pairs=()), states)[1]).max(1) > 1e-3).sum()
+    assert "ground at z = 0 m, 36 pairs of geoms" in report(scene)
     assert len(scene.geom_pairs) == 4 * 6 + 4 + 8 and len(whole.geom_pairs) == 36 + 12 and touched > n / 2
     check_gradients(scene, [x[:6] for x in states], rng)
 

@@ -61,7 +61,8 @@ def _parts(scene: Scene) -> Iterator[str]:
     yield f"mass       {scene.mass.sum():.4g} kg"
     yield f"controls   {scene.nu - pulling} motors, {pulling} muscles"
     yield f"timestep   {1e3 * m.opt.timestep:g} ms in the file; in a task control_dt / substeps"
-    yield f"contact    {scene.ncontact} points, {ground}"
+    pairs = f", {len(scene.geom_pairs)} pairs of geoms" * bool(scene.geom_pairs)
+    yield f"contact    {scene.ncontact} points, {ground}{pairs}"
     yield f"features   {', '.join(sorted(scene.features))}"
 
 
