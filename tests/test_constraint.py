@@ -34,6 +34,7 @@ from test_terrain import HILLS, everywhere, hopping, pressed
 import diffsim
 from diffsim.extra.gait import trace
 from diffsim.extra.terrain import incline
+from diffsim.kernels import constraint
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim import simulator
@@ -626,6 +627,22 @@ def test_steps_that_do_not_converge_are_counted(monkeypatch):
     wrong = sum((env.step(action), env.sim.residual > env.sim.integration.tolerance)[1].int() for _ in range(20))
     assert wrong.sum() > 0 and torch.equal(env.sim.unconverged, wrong.int())
     assert env.take_statistics()["unconverged"] == wrong.sum() and not env.sim.unconverged.any()
+
+
+def test_steps_that_have_no_room_for_a_contact_are_counted(monkeypatch):
+    """And no others: those are MuJoCo's."""
+    monkeypatch.setattr(constraint, "MOST_CONTACTS", (2, 4))
+    feet = "".join(f'<geom type="sphere" size=".05" pos="{0.1 * k} {0.1 * (k % 2)} 0"/>' for k in range(6))
+    scene = parse(robot(f'<body name="comb"> <freejoint/> {feet} </body>'))
+    turns = np.linspace(-0.031, 0.031, 13)
+    qpos, rest = np.zeros((13, 7)), np.zeros((13, 6))
+    qpos[:, 2], qpos[:, 3], qpos[:, 5] = 0.045, np.cos(turns / 2), np.sin(turns / 2)
+    numbers = (qpos[:, 2:3] - np.arange(6) * 0.1 * np.sin(turns)[:, None] < 0.05).sum(1)
+    _, qvel, residual = step(scene, (qpos, rest, np.zeros((13, 0))))
+    expected = in_mujoco(scene, qpos, rest, np.zeros((13, 0)))[1]
+    assert {3, 4, 5, 6} < set(numbers.tolist())
+    assert ((residual > 1e-4) == (numbers > 4)).all()
+    np.testing.assert_allclose(qvel[numbers <= 4], expected[numbers <= 4], rtol=1e-8, atol=1e-8)
 
 
 # Single precision, metrics, bad input

@@ -34,6 +34,16 @@ from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
 from diffsim.kernels.wide import blocks
 
+# Contacts of a lane with the ground at once, on a GPU and on a CPU, where a block unites those of its environments. A
+# GPU's compiler writes out how each element of a local array begins: for the 456 points of a G1's meshes in a minute.
+MOST_CONTACTS = 64, 256
+UNSOLVED = 1e8  # square of the acceleration by which a step is wrong that lacks a contact for want of room
+
+
+def contact_room(spec: KernelSpec) -> int:
+    """Return how many contacts with the ground have room."""
+    return max(1, min(spec.spheres, MOST_CONTACTS[not spec.env_last]))
+
 
 @cache
 def constraint_law(spec: KernelSpec) -> SimpleNamespace:
@@ -42,7 +52,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     Params, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
     Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
     CarrierPos, Frame, ground, FRAMED = t.CarrierPos, t.Frame, terrain_contact(spec), spec.framed
-    TERRAIN, PYRAMID, BOX = spec.has("terrain pyramid box")
+    (TERRAIN, PYRAMID, BOX), ROOM = spec.has("terrain pyramid box"), contact_room(spec)
     cone = pyramidal_cone(spec) if PYRAMID else elliptic_cone(spec)
     in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
@@ -111,51 +121,69 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return p, jar, vec4(D, state[1], state[2], state[3]), coef
 
     @wp.func
-    def begin_contacts(m: Model, here: Lane, links: t.Links, carrier: CarrierPos, contacts: t.Contacts):
-        """Set up a lane's contacts at the start of a substep, with zero acceleration.
+    def begin_contacts(
+        m: Model, here: Lane, links: t.Links, carrier: CarrierPos, motions: t.Motions, contacts: t.Contacts
+    ):
+        """List a lane's contacts at the start of a substep, with zero acceleration; returns their number.
 
         The force is linear about the last substep's jar; a new contact is in the quadratic zone.
         """
-        first = m.contact_begin[here.at]
+        end = wp.min(here.contacts, ROOM)
+        for s in range(end):
+            contacts[s].last_sphere = contacts[s].sphere
+            contacts[s].last_active = contacts[s].active
+            contacts[s].last_jar = contacts[s].jar
+        last = int(0)
+        number = int(0)
         for i in range(here.n):
+            motions[i].contacts_begin = wp.min(number, ROOM)
             for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
-                s = c - first
                 centre, distance, active, E, _ = locate_contact(m, here, c, links[i], carrier)
-                if wp.static(PYRAMID):
-                    E = E * cone.frame(cone.heading(m, c, links[i].R, E))
-                sticking = T(1.0) - active * contacts[s].active
-                contacts[s].active = active
                 if block.any_of(active):
-                    p, jar, state, coef = contact_state(m, here, c, centre, distance, active, E, links[i].V, vec6())
-                    last_jar = vec3()
-                    for r in range(3):
-                        last_jar[r] = pick(T(0.0), sticking, jar[r], contacts[s].jar[r])
-                    f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), last_jar, sticking)
-                    contacts[s].p = p
-                    contacts[s].jar = jar
-                    contacts[s].D = state[0]
-                    contacts[s].f = f + H * (last_jar - jar)
-                    contacts[s].H = H
-                    if wp.static(FRAMED):
-                        contacts[s].E = E
+                    if number < ROOM:
+                        s = number
+                        if wp.static(PYRAMID):
+                            E = E * cone.frame(cone.heading(m, c, links[i].R, E))
+                        while last < end and contacts[wp.min(last, ROOM - 1)].last_sphere < c:
+                            last = last + 1
+                        sticking = T(1.0)
+                        last_jar = vec3()
+                        if last < end:
+                            if contacts[last].last_sphere == c:
+                                sticking = T(1.0) - active * contacts[last].last_active
+                                last_jar = contacts[last].last_jar
+                        p, jar, state, coef = contact_state(m, here, c, centre, distance, active, E, links[i].V, vec6())
+                        for r in range(3):
+                            last_jar[r] = pick(T(0.0), sticking, jar[r], last_jar[r])
+                        f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), last_jar, sticking)
+                        contacts[s].sphere = c
+                        contacts[s].active = active
+                        contacts[s].p = p
+                        contacts[s].jar = jar
+                        contacts[s].D = state[0]
+                        contacts[s].f = f + H * (last_jar - jar)
+                        contacts[s].H = H
+                        if wp.static(FRAMED):
+                            contacts[s].E = E
+                    number = number + 1
+            motions[i].contacts_end = wp.min(number, ROOM)
+        return number
 
     @wp.func
-    def add_contacts(m: Model, here: Lane, k: int, contacts: t.Contacts, load: Load):
-        """Add link k's contacts, linear about the iterate, to its load."""
-        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            s = c - m.contact_begin[here.at]
-            if block.any_of(contacts[s].active):
-                p = contacts[s].p
-                H = contacts[s].H
-                f = contacts[s].f
-                if wp.static(FRAMED):
-                    f = contacts[s].E * f
-                    H = contacts[s].E * H * wp.transpose(contacts[s].E)
-                PH = wp.skew(p) * H
-                load.a = load.a - PH * wp.skew(p)
-                load.b = load.b + PH
-                load.d = load.d + H
-                load.f = load.f - force_at(p, f)
+    def add_contacts(begin: int, end: int, contacts: t.Contacts, load: Load):
+        """Add a link's contacts, linear about the iterate, to its load."""
+        for s in range(begin, end):
+            p = contacts[s].p
+            H = contacts[s].H
+            f = contacts[s].f
+            if wp.static(FRAMED):
+                f = contacts[s].E * f
+                H = contacts[s].E * H * wp.transpose(contacts[s].E)
+            PH = wp.skew(p) * H
+            load.a = load.a - PH * wp.skew(p)
+            load.b = load.b + PH
+            load.d = load.d + H
+            load.f = load.f - force_at(p, f)
         return load
 
     @wp.func
@@ -180,56 +208,54 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return x
 
     @wp.func
-    def trial_contacts(m: Model, here: Lane, k: int, step: vec6, alpha: T, evaluation: int, contacts: t.Contacts):
-        """Evaluate link k's contacts after the trial step alpha step; returns their part of newton.evaluate_trial."""
+    def trial_contacts(
+        m: Model, here: Lane, begin: int, end: int, step: vec6, alpha: T, evaluation: int, contacts: t.Contacts
+    ):
+        """Evaluate a link's contacts after the trial step alpha step; returns their part of newton.evaluate_trial."""
         total = vec6()
-        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            s = c - m.contact_begin[here.at]
-            if block.any_of(contacts[s].active):
-                step_jar = point_velocity(step, contacts[s].p)
-                if wp.static(FRAMED):
-                    step_jar = in_frame(contacts[s].E, step_jar)
-                if evaluation == 0:
-                    contacts[s].Hs = contacts[s].H * step_jar
-                jar = contacts[s].jar + alpha * step_jar
-                friction = contact_constants(m, here, c)[2]
-                f, H = cone.force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
-                force_error = contacts[s].f - alpha * contacts[s].Hs - f
-                w = T(m.contact_params[c][4])
-                accel_error = acceleration_for(force_error, w, H)
-                total = total + vec6(
-                    wp.dot(step_jar, force_error),
-                    wp.dot(step_jar, contacts[s].Hs),
-                    wp.dot(step_jar, H * step_jar),
-                    wp.dot(accel_error, accel_error),
-                    w * wp.trace(H),
-                    T(0.0),
-                )
-                contacts[s].trial_jar = jar
-                contacts[s].trial_force = f
-                contacts[s].H = H
+        for s in range(begin, end):
+            c = contacts[s].sphere
+            step_jar = point_velocity(step, contacts[s].p)
+            if wp.static(FRAMED):
+                step_jar = in_frame(contacts[s].E, step_jar)
+            if evaluation == 0:
+                contacts[s].Hs = contacts[s].H * step_jar
+            jar = contacts[s].jar + alpha * step_jar
+            friction = contact_constants(m, here, c)[2]
+            f, H = cone.force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
+            force_error = contacts[s].f - alpha * contacts[s].Hs - f
+            w = T(m.contact_params[c][4])
+            accel_error = acceleration_for(force_error, w, H)
+            total = total + vec6(
+                wp.dot(step_jar, force_error),
+                wp.dot(step_jar, contacts[s].Hs),
+                wp.dot(step_jar, H * step_jar),
+                wp.dot(accel_error, accel_error),
+                w * wp.trace(H),
+                T(0.0),
+            )
+            contacts[s].trial_jar = jar
+            contacts[s].trial_force = f
+            contacts[s].H = H
         return total
 
     @wp.func
-    def accept_contacts(m: Model, here: Lane, contacts: t.Contacts):
+    def accept_contacts(here: Lane, contacts: t.Contacts):
         """Accept the last trial step of a lane's contacts."""
-        first = m.contact_begin[here.at]
-        for c in range(first, m.contact_begin[here.at + here.n]):
-            if block.any_of(contacts[c - first].active):
-                contacts[c - first].jar = contacts[c - first].trial_jar
-                contacts[c - first].f = contacts[c - first].trial_force
+        for s in range(wp.min(here.contacts, ROOM)):
+            contacts[s].jar = contacts[s].trial_jar
+            contacts[s].f = contacts[s].trial_force
 
     @wp.func
-    def record_contacts(m: Model, here: Lane, ck: t.Checkpoint, contacts: t.Contacts):
+    def record_contacts(here: Lane, ck: t.Checkpoint, contacts: t.Contacts):
         """Store jar of a lane's contacts in the checkpoint, after the accelerations.
 
         jar is a small difference of large numbers. Recomputed in float32 it could lie in another zone of the cone,
         whose forces do not match the stored factor.
         """
-        first = m.contact_begin[here.at]
-        for c in range(first, m.contact_begin[here.at + here.n]):
+        for s in range(wp.min(here.contacts, ROOM)):
             for r in range(3):
-                kin.store(ck.a, here.row, 2 * NV + 3 * c + r, here.e, contacts[c - first].jar[r])
+                kin.store(ck.a, here.row, 2 * NV + 3 * contacts[s].sphere + r, here.e, contacts[s].jar[r])
 
     @wp.func
     def add_contacts_adjoint(

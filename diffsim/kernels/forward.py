@@ -11,7 +11,7 @@ from functools import cache
 
 import warp as wp
 
-from diffsim.kernels.constraint import constraint_law
+from diffsim.kernels.constraint import constraint_law, contact_room
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.force import external_force
 from diffsim.kernels.joint import joint_law
@@ -51,7 +51,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.room
     # Local arrays have at least one element, also where they are not read.
-    SPHERES, BALLS, TENSIONS = max(spec.spheres, 1) + spec.pair_sizes.blocks, max(NBALL, 1), NU if MUSCLE else 1
+    GROUND, BALLS, TENSIONS = contact_room(spec), max(NBALL, 1), NU if MUSCLE else 1
+    CONTACTS = GROUND + BLOCKS
 
     @wp.func
     def read_state(m: Model, here: Lane, batch: t.Batch, links: Links, ball_rot: Quats):
@@ -249,7 +250,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             joint.motors_forward(m, here, batch.ctrl, motions)
         if wp.static(CONSTRAINED):
             free_loads = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
-            contacts = wp.zeros(shape=SPHERES, dtype=Contact)
+            contacts = wp.zeros(shape=CONTACTS, dtype=Contact)
             residual = T(0.0)
         root = read_state(m, here, batch, links, ball_rot)
         for sub in range(substeps):
@@ -287,10 +288,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 root.wdot = vec3()
                 root.vdot = vec3()
                 if wp.static(CONTACT):
-                    constraint.begin_contacts(m, here, links, carrier, contacts)
+                    here.contacts = constraint.begin_contacts(m, here, links, carrier, motions, contacts)
                 newton.initialize(m, here, links, motions, loads, free_loads, root)
                 if wp.static(PAIRS):
-                    here.begin = SPHERES - BLOCKS
+                    here.begin = int(GROUND)
                     here.end = pairs.begin(m, here, links, motions, root.pos, contacts)
                 phase = int(NEWTON)
                 while phase < DONE:
@@ -334,7 +335,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if record == 1:  # the acceleration before damping, at which the adjoint differentiates the constraints
                     record_accelerations(m, here, ck, NV, root.newton_vdot, root.newton_wdot, motions)
                     if wp.static(CONTACT):
-                        constraint.record_contacts(m, here, ck, contacts)
+                        constraint.record_contacts(here, ck, contacts)
                     if wp.static(PAIRS):
                         pairs.record(here, ck, contacts)
                 for i in range(1, here.n):

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.constraint import constraint_law
+from diffsim.kernels.constraint import UNSOLVED, constraint_law, contact_room
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.model import functions, types
@@ -45,6 +45,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
     ROUNDING = ROUND_OFF * (6e-8 if t.U == wp.float32 else 1.1e-16)
     FIRST = 0 if spec.floating else 1 + spec.inert  # the first link with inertia
     PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
+    ROOM, FULL = contact_room(spec), spec.spheres > contact_room(spec)
 
     @wp.func
     def initialize(m: Model, here: Lane, links: Links, motions: Motions, loads: Loads, free_loads: Loads, root: Root):
@@ -76,7 +77,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             load.f = load.f + join(load.a * a + load.b * l, a * load.b + load.d * l)
             if wp.static(CONTACT):
                 if i >= FIRST:
-                    load = constraint.add_contacts(m, here, here.at + i, contacts, load)
+                    load = constraint.add_contacts(motions[i].contacts_begin, motions[i].contacts_end, contacts, load)
             loads[i] = load
         if wp.static(PAIRS):
             pairs.add_forces(m, here, contacts, motions, loads)
@@ -114,7 +115,12 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                     motions[i].trial_slope = trial[1]
             if wp.static(CONTACT):
                 if i >= FIRST:
-                    total = total + constraint.trial_contacts(m, here, k, motions[i].A, alpha, evaluation, contacts)
+                    begin, end = motions[i].contacts_begin, motions[i].contacts_end
+                    total = total + constraint.trial_contacts(
+                        m, here, begin, end, motions[i].A, alpha, evaluation, contacts
+                    )
+        if wp.static(FULL):
+            total[3] = total[3] + T(wp.where(here.contacts > ROOM, UNSOLVED, 0.0))
         if wp.static(PAIRS):
             total = total + pairs.trial(m, here, motions, alpha, contacts)
         if wp.static(SHARED):
@@ -259,7 +265,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             motions[i].con_force = motions[i].trial_force
             motions[i].con_slope = motions[i].trial_slope
         if wp.static(CONTACT):
-            constraint.accept_contacts(m, here, contacts)
+            constraint.accept_contacts(here, contacts)
         if wp.static(PAIRS):
             pairs.accept(here, contacts)
         status.passes = status.passes + 1

@@ -11,14 +11,13 @@ import warp as wp
 
 from diffsim.kernels.box_contacts import box_contacts
 from diffsim.kernels.capsule_contacts import capsule_contacts
+from diffsim.kernels.constraint import UNSOLVED
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.pair_geometry import pair_geometry
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 from diffsim.robot.pairs import BOXES, CAPSULE_BOX, PARALLEL
-
-UNSOLVED = 1e8  # square of the acceleration by which a step is wrong that lacks a contact for want of room
 
 
 @cache

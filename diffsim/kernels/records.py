@@ -86,8 +86,14 @@ def add_constraints(
             "H": mat3,  # minus the force's derivatives in jar, of the last trial step
             "D": T,  # inverse of the regularised inertia
             "active": T,  # 1 within the margin
+            "sphere": int,  # of the ground's contacts, which are listed in the order of the spheres
+            # The same element of the last substep's list
+            "last_sphere": int,
+            "last_active": T,
+            "last_jar": vec3,
         },
     }
+    structs["Lane"] |= {"contacts": int}  # number of contacts with the ground, also of those without room
     if "tendon_damping" in spec.features:
         for name in ("Motion", "Node"):
             structs[name] |= {"tendon_damping": T}  # of the joint, implicit, by tendons; the base's of a whole chain
@@ -101,6 +107,8 @@ def add_constraints(
         structs["Adjoint"] |= {"b": vec6}  # B
         structs["Motion"] |= {
             "accel_link": vec6,  # acceleration of the link, of Newton's iterate
+            "contacts_begin": int,  # of the link's contacts in their list
+            "contacts_end": int,
             "limit": vec3,  # the limit's row, see constraint.limit_state
             "accel_joint": T,  # acceleration of the joint, of Newton's iterate
             "free_force": T,  # force of the joint without constraints
