@@ -36,7 +36,7 @@ from diffsim.kernels.wide import blocks
 
 # Contacts of a lane with the ground at once, on a GPU and on a CPU, where a block unites those of its environments. A
 # GPU's compiler writes out how each element of a local array begins: for the 456 points of a G1's meshes in a minute.
-MOST_CONTACTS = 64, 256
+MOST_CONTACTS = 64, 128
 UNSOLVED = 1e8  # square of the acceleration by which a step is wrong that lacks a contact for want of room
 
 
