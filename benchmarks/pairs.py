@@ -6,7 +6,7 @@
 Solver: MuJoCo moves a scene. From states on the way with rows between bodies, a substep in float64 ends after 1, 2, ...
 passes of Newton's method. At each iterate conjugate gradients run once more, by the rule of kernels/pair_solver.py on
 dense matrices of MuJoCo's rows. States in which a step of theirs is not the kernel's are `left out`. All shapes are
-those of `as_capsules`, and MuJoCo has no islands. Gradients are those of mjData.solver. MuJoCo starts from its last
+those of `as_primitives`, and MuJoCo has no islands. Gradients are those of mjData.solver. MuJoCo starts from its last
 acceleration and goes on to its own tolerance; `cold` counts its passes from qacc_smooth until its gradient is ours.
 
 Time: a substep of the G1 with pairs relative to one without, in states where nothing touches, and where the legs do.
@@ -36,7 +36,7 @@ from diffsim.kernels.pair_adjoint import ACCURACY_ADJOINT
 from diffsim.kernels.pair_solver import ROUND_OFF
 from diffsim.kernels.pairs import ACCURACY
 from diffsim.robot.elements import control_range
-from diffsim.robot.pairs import as_capsules, with_pairs
+from diffsim.robot.pairs import as_primitives, with_pairs
 from diffsim.robot.scene import Array
 from diffsim.sim import simulator
 from diffsim.training import Count, fail
@@ -189,7 +189,7 @@ def statistics(m: mujoco.MjModel, data: mujoco.MjData, qacc: Array) -> dict[str,
 
 
 def measure_solver(args: Args, name: str) -> Iterator[Row]:
-    m, table = as_capsules(args.model(name)), list[dict[str, float]]()
+    m, table = as_primitives(args.model(name)), list[dict[str, float]]()
     m.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     m.opt.disableflags |= DISABLE.mjDSBL_ISLAND
     visited, theirs = zip(*motion(m), strict=True)
@@ -236,7 +236,7 @@ def measure_time(args: Args, name: str) -> Iterator[Row]:
     crossing = tuple((a, b) for a, b in scene.geom_pairs if {legs[a], legs[b]} == {"left", "right"})
     kinds = {"none": (), "legs": crossing, "all": scene.geom_pairs}
     for num_envs, cross in [(n, cross) for n in args.num_envs for cross in (False, True)]:
-        drawn = torch.tensor(poses(as_capsules(m), set(crossing), cross, 64)).repeat(-(-num_envs // 64), 1)[:num_envs]
+        drawn = torch.tensor(poses(as_primitives(m), set(crossing), cross, 64)).repeat(-(-num_envs // 64), 1)[:num_envs]
         rest = [torch.zeros(num_envs, n, dtype=torch.float64) for n in (m.nv, m.nu)]
         states = [(drawn.roll(k, 0), rest[0], rest[1]) for k in range(args.states + 1)]
         timers = {}

@@ -19,7 +19,7 @@ from test_gradient import gradients, weights
 from diffsim.extra.report import approximations, report
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
-from diffsim.robot.pairs import as_capsules, with_pairs
+from diffsim.robot.pairs import as_primitives, with_pairs
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -309,11 +309,10 @@ def test_spheres_touch_boxes_as_in_mujoco(cone, rng):
     check_gradients(scene, [x[:8] for x in states], rng)
 
 
-def crawler(cone):
+def crawler(cone, step='type="box" size=".1 .5 .05"', rod='type="capsule" size=".03 .2"', rest=""):
     """A body on four legs over stairs, one of whose steps is tilted, a fixed ball, a fixed rod and the ground."""
     steps = "".join(
-        f'<geom type="box" pos="{0.2 * k} 0 {0.05 * k}" size=".1 .5 .05" euler="0 {10 * (k == 3)} 0"/>'
-        for k in range(-2, 4)
+        f'<geom {step} pos="{0.2 * k} 0 {0.05 * k}" euler="0 {10 * (k == 3)} 0" name="step {k}"/>' for k in range(-2, 4)
     )
     legs = "".join(
         f"""<body pos="{x} {y} 0"> <joint axis="0 1 0" range="-60 60"/>
@@ -324,21 +323,25 @@ def crawler(cone):
     )
     return parse(f"""<mujoco> <option cone="{cone}"/> <worldbody> <geom type="plane" size="1 1 1"/>
         {steps} <geom size=".1" pos="-.2 .1 .2"/>
-        <body pos=".1 .2 .2"> <geom type="capsule" size=".03 .2" euler="90 0 20" contype="3" conaffinity="3"/> </body>
+        <body pos=".1 .2 .2"> <geom {rod} euler="90 0 20" contype="3" conaffinity="3" name="rod"/> </body>
         <body> <freejoint/> <geom type="box" size=".1 .1 .03" contype="0" conaffinity="0"/> {legs} </body>
-        </worldbody></mujoco>""")
+        </worldbody>{rest}</mujoco>""")
+
+
+def crawler_states(scene, n, rng):
+    """Random states of it in most of which it touches the stairs."""
+    qpos, qvel, ctrl = free_states(scene, n, rng)
+    qpos[:, :3] = rng.uniform((-0.3, -0.2, 0.15), (0.4, 0.2, 0.4), (n, 3))
+    qpos[:, 3:7] = np.array([1, 0, 0, 0]) + 0.2 * rng.normal(size=(n, 4))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    return qpos, 0.3 * qvel, ctrl
 
 
 @pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
 def test_fixed_geoms_are_touched_as_in_mujoco(cone, rng):
     """Without `with_pairs` by a robot whose parts do not touch each other."""
     scene, n = crawler(cone), 64
-    qpos, qvel, ctrl = free_states(scene, n, rng)
-    qpos[:, :3] = rng.uniform((-0.3, -0.2, 0.15), (0.4, 0.2, 0.4), (n, 3))
-    qpos[:, 3:7] = np.array([1, 0, 0, 0]) + 0.2 * rng.normal(size=(n, 4))
-    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-    states, touched = (qpos, 0.3 * qvel, ctrl), 0
-    whole = with_pairs(scene)
+    states, touched, whole = crawler_states(scene, n, rng), 0, with_pairs(scene)
     cases = [(scene, apart_from_itself(scene))] + [(whole, model_as_it_is(scene))] * (cone == "pyramidal")
     for each, model in cases:
         expected, found = in_mujoco(scene, *states, model=model)[1], step(each, states)[1]
@@ -347,6 +350,58 @@ def test_fixed_geoms_are_touched_as_in_mujoco(cone, rng):
     assert "ground at z = 0 m, 36 pairs of geoms" in report(scene)
     assert len(scene.geom_pairs) == 4 * 6 + 4 + 8 and len(whole.geom_pairs) == 36 + 12 and touched > n / 2
     check_gradients(scene, [x[:6] for x in states], rng)
+
+
+def test_other_fixed_shapes_are_touched_as_boxes_and_capsules(rng):
+    """Written out by hand; the robot's own and those of a fixed base become capsules, as above."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    chamfered = np.r_[corners * (1 / 8, 0.5, 1 / 32), corners * (3 / 32, 0.5, 1 / 16)]
+    mesh = f'<asset><mesh name="step" vertex="{" ".join(map(str, chamfered.ravel()))}"/></asset>'
+    scene = crawler("elliptic", 'type="mesh" mesh="step"', 'type="cylinder" size=".03 .2"', mesh)
+    written = crawler("elliptic", 'type="box" size=".125 .5 .0625"', 'type="capsule" size=".03 .17"')
+    states = crawler_states(scene, 64, rng)
+    found, expected = (step(scene, states)[1], in_mujoco(written, *states, model=apart_from_itself(written))[1])
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+    assert scene.geom_pairs == written.geom_pairs
+    assert abs(expected - in_mujoco(scene, *states, model=apart_from_itself(scene))[1]).max() > 1e-2
+    (told,) = (line for line in approximations(scene) if "Fixed" in line)
+    *steps, rod = re.findall(r"'([\w -]+)' as a (\w+) \([a-z ]*([\d.]+) mm\)", told)
+    assert sorted(name for name, *_ in steps) == [f"step {k}" for k in (-1, -2, 0, 1, 2, 3)]
+    assert {kind for _, kind, _ in steps} == {"box"} and rod[:2] == ("rod", "capsule")
+    assert float(steps[0][2]) == pytest.approx(1000 / 32 / 2**0.5, rel=0.05)
+    assert float(rod[2]) == pytest.approx(30 * (2**0.5 - 1), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("shape", "fixed", "elsewhere"),
+    [
+        ('type="cylinder" size=".05 .3"', "capsule", "capsule"),
+        ('type="cylinder" size=".5 .02"', "box", "capsule"),
+        ('type="cylinder" size=".06 .06"', "sphere", "sphere"),
+        ('type="ellipsoid" size=".1 .2 .1"', "capsule", "capsule"),
+        ('type="mesh" mesh="plate"', "box", "capsule"),
+        ('type="box" size=".1 .2 .3"', "box", "box"),
+    ],
+)
+def test_what_stands_for_a_shape(shape, fixed, elsewhere):
+    """A box where it is nearer, of obstacles only."""
+    plate = '<asset><mesh name="plate" vertex="0 0 0 1 0 0 0 1 0 1 1 0 0 0 .1 1 0 .1 0 1 .1 1 1 .1"/></asset>'
+    arm = f'<body pos="3 0 0"> <geom {shape}/> <body> <joint/> <geom {shape} mass="1"/> </body> </body>'
+    m = as_primitives(parse(robot(f"{arm} <geom {shape}/>", plate, "")).mj_model)
+    kinds = [mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in m.geom_type]
+    assert kinds == [fixed, elsewhere, elsewhere]
+
+
+def test_fixed_shapes_that_would_overlap_at_the_start_are_left_out():
+    """Of balls beside and above a round table."""
+    balls = "".join(
+        f'<body pos=".45 .45 {z}"> <joint type="slide"/> <geom name="ball {z}" size=".05"/> </body>' for z in (0, 1)
+    )
+    scene = parse(robot(f'{balls} <geom name="table" type="cylinder" size=".5 .02"/>', "", ""))
+    (first, second), (pair,) = (scene.mj_model.geom(f"ball {z}").id for z in (0, 1)), scene.geom_pairs
+    assert second in pair and first not in pair
+    sentence = "Left out, because such shapes overlap at the start: contact of the geoms 'table' and 'ball 0'."
+    assert sentence in approximations(scene)
 
 
 def apart_from_itself(scene):
@@ -461,7 +516,7 @@ def test_other_shapes_touch_as_their_capsules(rng):
     mesh = '<asset><mesh name="tetra" vertex="0 0 0 .3 0 0 0 .2 0 0 0 .2"/></asset>'
     scene = with_pairs(parse(robot(arms, mesh, "")))
     states = rng.uniform(-2, 2, (32, 6)), 0.3 * rng.normal(size=(32, 6)), np.zeros((32, 0))
-    _, expected, kinds = in_mujoco(scene, *states, model=as_capsules(model_as_it_is(scene)))
+    _, expected, kinds = in_mujoco(scene, *states, model=as_primitives(model_as_it_is(scene)))
     assert approximations(scene) == ("Shapes that touch others as capsules: 3 (surfaces differ by up to 105 mm).",)
     assert len(scene.geom_pairs) == 15 and STATES["quadratic"] in kinds
     np.testing.assert_allclose(step(scene, states)[1], expected, rtol=1e-8, atol=1e-8)

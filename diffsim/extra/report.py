@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from diffsim.extra.gait import trace
 from diffsim.extra.own_task import start_control
@@ -16,11 +15,10 @@ from diffsim.robot.contact import (
     base_geoms,
     contact_points,
     ground_pairs,
-    hull,
     pair_law,
 )
-from diffsim.robot.elements import at_rest, control_range, label, listed, motors, muscles
-from diffsim.robot.pairs import as_capsules, is_exact, self_pairs
+from diffsim.robot.elements import control_range, label, listed, motors, muscles
+from diffsim.robot.pairs import as_primitives, deviation, directions, is_exact, obstacle_geoms, reach, self_pairs
 from diffsim.robot.scene import Scene
 
 Kind, Geom, Integrator = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtIntegrator
@@ -36,7 +34,7 @@ REPLACED = {
     int(Integrator.mjINT_RK4): (Integrator.mjINT_EULER, "integrator RK4, simulated as Euler"),
     int(Integrator.mjINT_IMPLICIT): (Integrator.mjINT_IMPLICITFAST, "integrator implicit, simulated as implicitfast"),
 }
-DIRECTIONS, STARTS = 2000, 12  # in which shapes are measured; of the motions of which steps are compared
+STARTS = 12  # motions of which steps are compared
 LEAST_ERROR = 0.01  # %, that is told
 
 
@@ -82,19 +80,32 @@ def _bodies(scene: Scene) -> Iterator[str]:
 
 
 def _self_contact(scene: Scene) -> Iterator[str]:
-    m, fitted = scene.mj_model, as_capsules(scene.mj_model)
+    m, fitted, fixed = scene.mj_model, as_primitives(scene.mj_model), obstacle_geoms(scene.mj_model)
     inexact = {geom for pair in scene.geom_pairs for geom in pair if not is_exact(m, *pair)}
-    if rough := [geom for geom in inexact if m.geom_type[geom] != fitted.geom_type[geom]]:
-        worst = max(float(abs(_reach(m, geom) - _reach(fitted, geom)).max()) for geom in rough)
-        yield f"Shapes that touch others as capsules: {len(rough)} (surfaces differ by up to {1e3 * worst:.3g} mm)."
-    if not (pairs := [pair for pair in self_pairs(m) if pair not in scene.geom_pairs]):
-        return
+    off = {geom: 1e3 * deviation(m, fitted, geom) for geom in inexact if m.geom_type[geom] != fitted.geom_type[geom]}
+    order = sorted(off, key=lambda geom: (-off[geom], geom))
+    if rough := [geom for geom in order if not fixed[geom]]:
+        yield f"Shapes that touch others as capsules: {len(rough)} (surfaces differ by up to {off[rough[0]]:.3g} mm)."
+    if rough := [geom for geom in order if fixed[geom]]:
+        shapes = [Geom(fitted.geom_type[geom]).name.removeprefix("mjGEOM_").lower() for geom in rough]
+        names = [label(m, Kind.mjOBJ_GEOM, geom) for geom in rough]
+        words = ["surfaces differ by up to ", *[""] * len(rough)]
+        told = [f"{names[k]} as a {shapes[k]} ({words[k]}{off[geom]:.3g} mm)" for k, geom in enumerate(rough)]
+        yield f"Fixed geoms touch others as simpler shapes: {listed(told)}."
+    there = set(scene.geom_pairs)
+    missing = [pair for pair in self_pairs(m) if pair not in there]
+    if gone := [pair for pair in missing if fixed[list(pair)].any()]:
+        yield f"Left out, because such shapes overlap at the start: contact of {_pairs_of(m, gone)}."
+    if pairs := [pair for pair in missing if pair not in set(gone)]:
+        yield (
+            f"The robot's parts pass through each other: {_pairs_of(m, pairs)}, would collide in MuJoCo."
+            + " Geoms of its fixed base are among them." * bool(base_geoms(m)[np.array(pairs)].any())
+        )
+
+
+def _pairs_of(m: mujoco.MjModel, pairs: list[tuple[int, int]]) -> str:
     names = " and ".join(label(m, Kind.mjOBJ_GEOM, geom) for geom in pairs[0])
-    count = f"{len(pairs)} pairs of geoms, such as" if len(pairs) > 1 else "the geoms"
-    yield (
-        f"The robot's parts pass through each other: {count} {names}, would collide in MuJoCo."
-        + " Geoms of its fixed base are among them." * bool(base_geoms(m)[np.array(pairs)].any())
-    )
+    return f"{len(pairs)} pairs of geoms, such as {names}" if len(pairs) > 1 else f"the geoms {names}"
 
 
 def _ground(scene: Scene) -> Iterator[str]:
@@ -111,31 +122,10 @@ def _ground(scene: Scene) -> Iterator[str]:
 
 def _depth(m: mujoco.MjModel, geom: int) -> float:
     """Return how far [m] a shape reaches beyond its contact points, in the direction where that is farthest."""
-    data = at_rest(m)
-    points = data.geom_xpos[geom] + contact_points(m, geom)[0] @ data.geom_xmat[geom].reshape(3, 3).T
-    return float((_reach(m, geom) - (_directions() @ points.T).max(1)).max())
-
-
-def _directions() -> NDArray[np.float64]:
-    turn, z = np.pi * (3 - 5**0.5) * np.arange(DIRECTIONS), 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
-    level = np.sqrt(1 - z**2)
-    return np.stack((level * np.cos(turn), level * np.sin(turn), z), 1)
-
-
-def _reach(m: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
-    """Return how far [m] a shape reaches from the world's origin in each direction, in the reference pose."""
-    data, (a, b, c), kind = at_rest(m), m.geom_size[geom], m.geom_type[geom]
-    directions = _directions() @ data.geom_xmat[geom].reshape(3, 3)
-    x, y, z = abs(directions.T)
-    reach = {
-        int(Geom.mjGEOM_SPHERE): a + 0 * z,
-        int(Geom.mjGEOM_CAPSULE): a + b * z,
-        int(Geom.mjGEOM_CYLINDER): a * np.hypot(x, y) + b * z,
-        int(Geom.mjGEOM_BOX): a * x + b * y + c * z,
-        int(Geom.mjGEOM_ELLIPSOID): np.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2),
-    }
-    corners = hull(m, m.geom_dataid[geom]) if kind == Geom.mjGEOM_MESH else np.zeros((1, 3))
-    return reach.get(int(kind), (directions @ corners.T).max(1)) + _directions() @ data.geom_xpos[geom]
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, m.geom_quat[geom])
+    points = m.geom_pos[geom] + contact_points(m, geom)[0] @ rotation.reshape(3, 3).T
+    return float((reach(m, geom) - (directions() @ points.T).max(1)).max())
 
 
 def _options(scene: Scene) -> Iterator[str]:

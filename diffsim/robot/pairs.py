@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.contact import UNBOUNDED, base_geoms, collide, declared_pairs, pair_law
+from diffsim.robot.contact import UNBOUNDED, base_geoms, collide, declared_pairs, hull, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
 from diffsim.robot.scene import Array, Index, Scene, SceneError
 
@@ -20,7 +20,7 @@ Touch = Callable[[int, int], Array]  # two geoms
 JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs.py
 NAMES = "joint", "point", "turn", "geoms"
 _Geom = mujoco.mjtGeom
-SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "MESH")]  # made capsules
+SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "MESH")]  # made others
 # Kinds of two geoms: parallel capsules, spheres and capsules, a sphere and a box, a capsule and a box, two boxes
 PARALLEL, SEGMENTS, BALL_BOX, CAPSULE_BOX, BOXES = range(-1, 4)
 CONTACTS = {PARALLEL: 2, SEGMENTS: 1, BALL_BOX: 1, CAPSULE_BOX: 2, BOXES: 8}  # at most, of a pair
@@ -32,6 +32,7 @@ KINDS = {
 }
 FEATURES = {PARALLEL: "parallel_geoms", CAPSULE_BOX: "capsule_box_geoms", BOXES: "box_geoms"}
 STRAIGHT = 1e-4  # sine between two capsules that are parallel
+DIRECTIONS = 2000  # in which shapes are measured
 MOST_PAIRS = 64  # contacts at once, in the environments that a thread steps together
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
 
@@ -102,8 +103,8 @@ class _Rows:
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.m, self.data = scene, scene.mj_model, at_rest(scene.mj_model)
-        capsules = as_capsules(self.m) if scene.geom_pairs else self.m
-        self.capsules = capsules, at_rest(capsules)
+        shapes = as_primitives(self.m) if scene.geom_pairs else self.m
+        self.shapes = shapes, at_rest(shapes)
         self.links = list[tuple[Array, Array]]()  # pose of each link at the reference configuration
         for k in range(scene.nlink):
             rotation, position = self.links[scene.parent[k]] if k else (np.eye(3), np.zeros(3))
@@ -145,7 +146,7 @@ class _Rows:
 
     def add_geoms(self, a: int, b: int, params: Array) -> None:
         """Append the block of two geoms."""
-        (m, data), reach = self.capsules, params[10]
+        (m, data), reach = self.shapes, params[10]
         geoms = sorted((a, b), key=lambda geom: int(m.geom_type[geom]))  # MuJoCo's order: a sphere comes first
         ends, sizes, radii = list[Frame](), list[Array](), list[float]()
         for geom in geoms:
@@ -223,16 +224,15 @@ def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
     return found
 
 
+def obstacle_geoms(m: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Mark fixed geoms (ngeom,) of bounded shapes that are no part of the robot's base, such as a step of stairs."""
+    return (m.body_weldid[m.geom_bodyid] == 0) & ~base_geoms(m) & ~np.isin(m.geom_type, UNBOUNDED)
+
+
 def obstacle_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
-    """List those with a fixed geom that is no part of the robot's base, such as a step of stairs."""
-    fixed = (m.body_weldid[m.geom_bodyid] == 0) & ~base_geoms(m)
+    """List the pairs with such a geom."""
+    fixed = obstacle_geoms(m)
     return [pair for pair in self_pairs(m) if fixed[list(pair)].any()]
-
-
-def rough_obstacles(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Mark fixed geoms (ngeom,) that others would touch in another shape than the file's."""
-    touched = np.isin(range(m.ngeom), obstacle_pairs(m)) & (m.body_weldid[m.geom_bodyid] == 0)
-    return touched & np.isin(m.geom_type, SHAPES)
 
 
 def is_exact(m: mujoco.MjModel, a: int, b: int) -> bool:
@@ -240,33 +240,72 @@ def is_exact(m: mujoco.MjModel, a: int, b: int) -> bool:
     return not np.isin(m.geom_type[[a, b]], SHAPES).any()
 
 
-def as_capsules(m: mujoco.MjModel) -> mujoco.MjModel:
-    """Return a copy whose geoms have the shapes that touch each other here: capsules in place of SHAPES.
+def as_primitives(m: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy whose geoms have the shapes that touch each other here: a capsule or a box in place of SHAPES.
 
-    A capsule has the length of its geom's bounding box, and its mean width.
+    A capsule has the length of its geom's bounding box, and its mean width. The bounding box itself stands for an
+    obstacle if its surface is clearly nearer to the shape's: pairs with a box cost more.
     """
-    fitted = copy.copy(m)
+    fitted, fixed = copy.copy(m), obstacle_geoms(m)
     for geom in np.flatnonzero(np.isin(m.geom_type, SHAPES)).tolist():
-        centre, half = np.split(m.geom_aabb[geom], 2)
-        along = int(half.argmax())
-        radius = float(np.delete(half, along).mean())
-        length = max(half[along] - radius, 0.0)
-        turn = np.zeros(4)
-        mujoco.mju_quatZ2Vec(turn, np.eye(3)[along])
-        mujoco.mju_mulPose(
-            fitted.geom_pos[geom], fitted.geom_quat[geom], m.geom_pos[geom], m.geom_quat[geom], centre, turn
-        )
-        fitted.geom_type[geom], fitted.geom_size[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE, (radius, length, 0.0)
-        fitted.geom_rbound[geom], fitted.geom_sameframe[geom] = radius + length, 0
-        fitted.geom_aabb[geom] = [0.0, 0.0, 0.0, radius, radius, radius + length]
+        _fit(m, fitted, geom, boxed=False)
+        if fixed[geom]:
+            difference = deviation(m, fitted, geom)
+            _fit(m, fitted, geom, boxed=True)
+            if deviation(m, fitted, geom) > 0.95 * difference:
+                _fit(m, fitted, geom, boxed=False)
     return fitted
+
+
+def _fit(m: mujoco.MjModel, fitted: mujoco.MjModel, geom: int, boxed: bool) -> None:
+    """Give a geom of the other model its bounding box or a capsule, or a sphere if that box is a cube."""
+    (centre, half), turn = np.split(m.geom_aabb[geom], 2), np.zeros(4)
+    kind, size, bound, along = _Geom.mjGEOM_BOX, half, np.linalg.norm(half), 2
+    if not boxed:
+        along = int(half.argmax())
+        radius, bound = np.delete(half, along).mean(), half[along]
+        kind = _Geom.mjGEOM_CAPSULE if bound > radius else _Geom.mjGEOM_SPHERE
+        size, half = np.array([radius, bound - radius, 0.0]), np.array([radius, radius, bound])
+    mujoco.mju_quatZ2Vec(turn, np.eye(3)[along])
+    mujoco.mju_mulPose(fitted.geom_pos[geom], fitted.geom_quat[geom], m.geom_pos[geom], m.geom_quat[geom], centre, turn)
+    fitted.geom_type[geom], fitted.geom_size[geom], fitted.geom_rbound[geom] = kind, size, bound
+    fitted.geom_aabb[geom], fitted.geom_sameframe[geom] = [0.0, 0.0, 0.0, *half], 0
+
+
+def deviation(m: mujoco.MjModel, other: mujoco.MjModel, geom: int) -> float:
+    """Return the largest distance [m] between the surfaces of a geom's convex hulls in two models."""
+    return float(abs(reach(m, geom) - reach(other, geom)).max())
+
+
+def directions() -> Array:
+    """Return unit vectors (DIRECTIONS, 3) that are spread evenly."""
+    turn, z = np.pi * (3 - 5**0.5) * np.arange(DIRECTIONS), 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS
+    level = np.sqrt(1 - z**2)
+    return np.stack((level * np.cos(turn), level * np.sin(turn), z), 1)
+
+
+def reach(m: mujoco.MjModel, geom: int) -> Array:
+    """Return how far [m] a shape reaches in each direction (DIRECTIONS,) from the origin of its body's frame."""
+    (a, b, c), kind, rotation = m.geom_size[geom], m.geom_type[geom], np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, m.geom_quat[geom])
+    along = directions() @ rotation.reshape(3, 3)
+    x, y, z = abs(along.T)
+    reaches = {
+        int(_Geom.mjGEOM_SPHERE): a + 0 * z,
+        int(_Geom.mjGEOM_CAPSULE): a + b * z,
+        int(_Geom.mjGEOM_CYLINDER): a * np.hypot(x, y) + b * z,
+        int(_Geom.mjGEOM_BOX): a * x + b * y + c * z,
+        int(_Geom.mjGEOM_ELLIPSOID): np.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2),
+    }
+    corners = hull(m, m.geom_dataid[geom]) if kind == _Geom.mjGEOM_MESH else np.zeros((1, 3))
+    return reaches.get(int(kind), (along @ corners.T).max(1)) + directions() @ m.geom_pos[geom]
 
 
 def with_pairs(scene: Scene) -> Scene:
     """Return a copy whose parts touch each other and fixed geoms as the file lets them, on MuJoCo's contact.
 
-    Capsules stand for other shapes than spheres, capsules and boxes, see `as_capsules`. A pair is left out whose
-    capsules overlap in the first keyframe, or the reference pose, though the file's shapes do not.
+    Capsules and boxes stand for other shapes, see `as_primitives`. A pair is left out that so overlaps in the first
+    keyframe, or the reference pose, though the file's shapes do not.
 
     Raises:
         SceneError: the numbers of a pair are not simulated.
@@ -282,7 +321,7 @@ def with_obstacles(scene: Scene) -> Scene:
 
 def _with(scene: Scene, candidates: list[tuple[int, int]]) -> Scene:
     m, pairs = scene.mj_model, list[tuple[int, int]]()
-    declarations, overlapping = declared_pairs(m), touching_pairs(as_capsules(m)) - touching_pairs(m)
+    declarations, overlapping = declared_pairs(m), touching_pairs(as_primitives(m)) - touching_pairs(m)
     for a, b in candidates:
         declared, solref = declarations.get((a, b)), pair_law(m, a, b).solref
         if (solref[0] > 0) != (solref[1] > 0) or (declared is not None and np.ptp(m.pair_friction[declared, :2])):

@@ -24,7 +24,6 @@ from diffsim.robot.elements import (
     numeric,
     servos,
 )
-from diffsim.robot.pairs import rough_obstacles
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
 
 Joint = mujoco.mjtJoint
@@ -242,7 +241,6 @@ def _contacts(m: mujoco.MjModel) -> Iterator[Row]:
     first, second = m.pair_friction[:, :2].T
     ends = {tuple(sorted(pair)) for pair in pairs}
     declared = np.isin(range(m.npair), [k for pair, k in declared_pairs(m).items() if pair in ends])
-    yield "geom", rough_obstacles(m), f"fixed geoms that touch others are spheres, capsules or boxes here{ONLY_DRAWN}"
     yield "geom", touching & other, f"contact is simulated with one ground plane only{ONLY_DRAWN}"
     yield "geom", touching & ~other & tilted, "the ground plane must be horizontal"
     yield "geom", ~shaped, f"its shape cannot touch the ground here{ONLY_DRAWN}"

@@ -146,7 +146,7 @@ def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[
     flags = ["--states", "8", "--output", str(tmp_path / "out")]
     foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
     out = capsys.readouterr().out
-    assert "6 files: 2 refused, 2 equal on the ground, 2 equal off the ground" in out
+    assert "6 files: 2 refused, 2 equal with contact, 2 equal without contact" in out
     assert "1 refused, actuator: stiffness and damping of a servo must not be negative (bad)" in out
     rows = {row["file"].partition("/")[0]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
     bad = "actuator number 0: stiffness and damping of a servo must not be negative"
@@ -156,7 +156,7 @@ def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert float(rows[name]["relative error of qacc"]) < 1e-9 and float(rows[name]["step"]) < 1e-9
         assert float(rows[name]["states"]) == foreign.STEPS
     assert rows["ball"]["absent meshes"] == "1" and rows["ball"]["with contact"] == "16"
-    assert rows["rough"]["outcome"] == "equal off the ground" and 0 < float(rows["rough"]["step of told contacts"]) < 1
+    assert rows["rough"]["outcome"] == "equal without contact" and 0 < float(rows["rough"]["step of told contacts"]) < 1
     assert "8 of each rim of a cylinder" in rows["rough"]["told"]
 
 
@@ -170,7 +170,7 @@ def test_no_recorded_difference_is_silent() -> None:
     ("cells", "expected"),
     [
         ({"step": ""}, "loaded"),
-        ({"step": 1e-9, "with contact": 3}, "equal on the ground"),
+        ({"step": 1e-9, "with contact": 3}, "equal with contact"),
         ({"step": 1e-3, "converged": 1e-9}, "equal if converged"),
         ({"step": 1e-3, "converged": 1e-3, "told": "Left out: noslip"}, "told"),
         ({"step": float("nan"), "converged": float("nan"), "told": ""}, "silent"),

@@ -103,10 +103,6 @@ REFUSED = {  # what the variants of test_variants.py have not
     "geom 'rock': contact is simulated with one ground plane only; set contype and conaffinity to 0 if only drawn": (
         pendulum(world='<geom name="rock" type="hfield" hfield="h"/>', rest=HILLS)
     ),
-    "geom 'rock': fixed geoms that touch others are spheres, capsules or boxes here; set contype": [
-        pendulum(world='<geom name="rock" type="cylinder" size="1 1 1"/>'),
-        pendulum(world='<body><geom name="rock" type="mesh" mesh="m"/></body>', rest=f"<asset>{TETRAHEDRON}</asset>"),
-    ],
     "geom 'floor', 'second': contact is simulated with one": pendulum(world=FLOOR + FLOOR.replace("floor", "second")),
     "geom 'rock': its shape cannot touch the ground here; set contype": asset('type="sdf" mesh="m"', TETRAHEDRON),
     "pair 'couple': margin must be finite": pair('margin="inf"'),
