@@ -9,7 +9,8 @@ dense matrices of MuJoCo's rows. States in which a step of theirs is not the ker
 those of `as_primitives`, and MuJoCo has no islands. Gradients are those of mjData.solver. MuJoCo starts from its last
 acceleration and goes on to its own tolerance; `cold` counts its passes from qacc_smooth until its gradient is ours.
 
-Time: a substep of the G1 with pairs relative to one without, in states where nothing touches, and where the legs do.
+Time: substeps of the G1 with pairs relative to those without, in states where nothing touches, and where the legs do.
+On a GPU pairs have one thread per environment, and what is without pairs may have more. `one thread` has not.
 Writes pairs_solver.csv and pairs_time.csv. Needs Menagerie's folders agility_cassie and unitree_g1, of which the time
 needs the latter.
 """
@@ -58,6 +59,7 @@ class Args(CommonFlags):
     num_envs: tuple[Count, ...] = (256,)  # batch sizes of the table of times
     states: Count = 5  # batches of states in which a substep is timed; the median over them counts
     repeats: Count = 9  # turns in each of them; the fastest counts
+    substeps: Count = 4  # in a control step
     env: tyro.conf.Suppress[Tasks] = ()
 
     def model(self, name: str) -> mujoco.MjModel:
@@ -235,19 +237,22 @@ def measure_time(args: Args, name: str) -> Iterator[Row]:
     legs = [any(part in body for part in HIP) and body.partition("_")[0] for body in bodies]
     crossing = tuple((a, b) for a, b in scene.geom_pairs if {legs[a], legs[b]} == {"left", "right"})
     kinds = {"none": (), "legs": crossing, "all": scene.geom_pairs}
+    kinds |= {"one thread": ()} if args.device == "cuda" else {}
     for num_envs, cross in [(n, cross) for n in args.num_envs for cross in (False, True)]:
         drawn = torch.tensor(poses(as_primitives(m), set(crossing), cross, 64)).repeat(-(-num_envs // 64), 1)[:num_envs]
         rest = [torch.zeros(num_envs, n, dtype=torch.float64) for n in (m.nv, m.nu)]
         states = [(drawn.roll(k, 0), rest[0], rest[1]) for k in range(args.states + 1)]
         timers = {}
         for kind, pairs in kinds.items():
-            own, how = dataclasses.replace(scene, geom_pairs=pairs), Integration("mujoco", 1)
-            timers[kind] = timer(Simulator(own, num_envs, how, m.opt.timestep, device=args.device, threads=1))
+            own, division = dataclasses.replace(scene, geom_pairs=pairs), (1, 1) if kind == "one thread" else None
+            how, seconds = Integration("mujoco", args.substeps), args.substeps * m.opt.timestep
+            sim = Simulator(own, num_envs, how, seconds, device=args.device, threads=1, division=division)
+            timers[kind] = timer(sim)
         times = race(timers, states, args.repeats)
         for kind, pairs in kinds.items():
             row: dict[str, object] = {"scene": name, "touching": "legs" if cross else "nothing", "pairs": kind}
             row |= {"number": len(pairs), "environments": num_envs, "device": device}
-            row |= {f"{way} (us/substep)": t / num_envs for way, t in times[kind].items()}
+            row |= {f"{way} (us/substep)": t / num_envs / args.substeps for way, t in times[kind].items()}
             yield row | {f"{way}, relative": t / times["none"][way] for way, t in times[kind].items()}
 
 
