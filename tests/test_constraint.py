@@ -618,6 +618,24 @@ def test_neighbours_do_not_change_where_an_environment_converges(rng):
     assert residuals.max() > 100 * residuals.min()  # some have converged long before others
 
 
+def test_contacts_of_an_earlier_rollout_leave_no_trace(rng):
+    """Of which the checkpoint holds longer lists where fewer feet touch now."""
+    scene, states = sliding_ant(0.3, 2.0, rng, 64)
+    states[0][:32, 2] -= 0.2  # all feet
+    states[0][32:, 3:7] += 0.2 * rng.normal(size=(32, 4))
+
+    def gradients_after(*orders):
+        sim = Simulator(scene, 64, Integration("mujoco", 1), H, dtype=torch.float64)
+        for order in orders:
+            sim.rewind()
+            start = [torch.tensor(x[order], requires_grad=True) for x in states]
+            grads = torch.autograd.grad(torch.cat(sim.step(*start), 1).square().sum(), start)
+        return torch.cat(grads, 1)
+
+    order = np.arange(64)
+    assert torch.equal(gradients_after(order, np.roll(order, 32)), gradients_after(np.roll(order, 32)))
+
+
 def test_steps_that_do_not_converge_are_counted(monkeypatch):
     """Each environment's, whose last pass is not enough; statistics take the count and begin anew."""
     monkeypatch.setattr(simulator, "PASSES", 1)

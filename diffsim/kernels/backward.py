@@ -183,11 +183,14 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         """Compute the partial derivatives of phi of each link into adj."""
         for i in range(1, INERT + 1):
             adj[i] = Adjoint()
+        s = int(0)  # the contact in the checkpoint
         for i in range(FIRST, here.n):
             k = here.at + i
             own = link.link_adjoint(m, here, k, links[i], nodes[i], carrier, adj_factors)
             if wp.static(CONSTRAINED and CONTACT):
-                own = constraint.add_contacts_adjoint(m, here, k, links[i], nodes[i], carrier, ck, own, adj_factors)
+                own, s = constraint.add_contacts_adjoint(
+                    m, here, k, s, links[i], nodes[i], carrier, ck, own, adj_factors
+                )
             if wp.static(DAMPED):
                 own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own, adj_factors)
             adj[i] = own

@@ -45,6 +45,11 @@ def contact_room(spec: KernelSpec) -> int:
     return max(1, min(spec.spheres, MOST_CONTACTS[not spec.env_last]))
 
 
+def contact_columns(spec: KernelSpec) -> int:
+    """Return how many columns of the checkpoint contacts take: each lane's with the ground, then those of pairs."""
+    return 4 * contact_room(spec) * spec.threads_per_env + 3 * spec.pairs
+
+
 @cache
 def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
@@ -248,14 +253,27 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def record_contacts(here: Lane, ck: t.Checkpoint, contacts: t.Contacts):
-        """Store jar of a lane's contacts in the checkpoint, after the accelerations.
+        """Store each of a lane's contacts in the checkpoint, after the accelerations: its sphere, and jar.
 
         jar is a small difference of large numbers. Recomputed in float32 it could lie in another zone of the cone,
         whose forces do not match the stored factor.
         """
-        for s in range(wp.min(here.contacts, ROOM)):
+        number = wp.min(here.contacts, ROOM)
+        for s in range(number):
+            column = 2 * NV + 4 * (ROOM * here.lane + s)
+            kin.store(ck.a, here.row, column, here.e, T(float(contacts[s].sphere)))
             for r in range(3):
-                kin.store(ck.a, here.row, 2 * NV + 3 * contacts[s].sphere + r, here.e, contacts[s].jar[r])
+                kin.store(ck.a, here.row, column + 1 + r, here.e, contacts[s].jar[r])
+        if number < ROOM:
+            kin.store(ck.a, here.row, 2 * NV + 4 * (ROOM * here.lane + number), here.e, T(-1.0))
+
+    @wp.func
+    def recorded_sphere(here: Lane, s: int, ck: t.Checkpoint):
+        """Return the sphere of a lane's contact s in the checkpoint, -1 after the last one."""
+        sphere = int(-1)
+        if s < ROOM:
+            sphere = int(block.element(kin.load(ck.a, here.row, 2 * NV + 4 * (ROOM * here.lane + s), here.e), 0))
+        return sphere
 
     @wp.func
     def add_contacts_adjoint(
@@ -263,6 +281,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         m: Model,
         here: Lane,
         k: int,
+        s: int,  # its first contact in the checkpoint
         # state in
         link: Link,
         node: t.Node,
@@ -272,60 +291,60 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         adj: t.Adjoint,
         adj_factors: t.Ts,
     ):
-        """Add the contacts' part of phi to link k's adjoints."""
-        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+        """Add the contacts' part of phi to link k's adjoints; returns them, and the next link's first contact."""
+        c = recorded_sphere(here, s, ck)
+        while c >= 0 and c < m.contact_begin[k + 1]:
             centre, distance, active, feature, curvature = locate_contact(m, here, c, link, carrier)
-            if block.any_of(active):
-                E = feature
-                if wp.static(PYRAMID):
-                    heading = cone.heading(m, c, link.R, feature)
-                    E = feature * cone.frame(heading)
-                p, _, state, coef = contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
-                jar = vec3()
-                for r in range(3):
-                    jar[r] = kin.load(ck.a, here.row, 2 * NV + 3 * c + r, here.e)
-                f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
-                w = in_frame(E, point_velocity(node.W, p))
-                velocity = in_frame(E, point_velocity(link.V, p))
-                g_jar = H * w
-                g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
-                if wp.static(VARIED):
-                    by_k = T(0.5) * coef[1] * wp.dot(g_jar, velocity) + g_jar[2] * state[2]
-                    by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                    adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
-                    adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
-                    adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
-                if wp.static(LEARNED):
-                    by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                    adj_factors[COLUMNS + 2 * c] = adj_factors[COLUMNS + 2 * c] - by_mu
-                    adj_factors[COLUMNS + 2 * c + 1] = adj_factors[COLUMNS + 2 * c + 1] + wp.dot(f, w)
-                if wp.static(FRAMED):  # adjoint of a rotation of the frame
-                    g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
-                if wp.static(PYRAMID):
-                    g_turn = cone.frame(heading) * g_turn
-                    g_heading = g_turn[2] * cone.heading_derivative(heading)
-                    adj.p = adj.p + sp.join(in_world(feature, g_heading), vec3())
-                    g_turn = g_turn - g_heading
-                f = in_world(E, f)
-                g_jar = in_world(E, g_jar)
-                G = force_at(p, g_jar)
-                wrench = force_at(p, f)
-                spin = wp.spatial_top(node.B) + coef[1] * wp.spatial_top(link.V)
-                g_p = wp.cross(g_jar, spin) - wp.cross(f, wp.spatial_top(node.W))
-                adj.w = adj.w - wrench
-                adj.v = adj.v + coef[1] * G
-                adj.b = adj.b + G
-                # The point follows the sphere's centre, at half its speed along the normal, which turns with it.
-                g_p = in_frame(feature, g_p)
-                g_p[2] = T(0.5) * g_p[2] + g_r
-                if wp.static(TERRAIN):
-                    arm = T(m.contact_radius[c]) + T(0.5) * distance
-                    g_p[0] = g_p[0] + curvature * (g_turn[1] - arm * g_p[0])
-                adj.p = adj.p + force_at(centre, in_world(feature, g_p))
-                adj.p = (
-                    adj.p + wp.spatial_cross_dual(coef[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
-                )
-        return adj
+            E = feature
+            if wp.static(PYRAMID):
+                heading = cone.heading(m, c, link.R, feature)
+                E = feature * cone.frame(heading)
+            p, _, state, coef = contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
+            jar = vec3()
+            for r in range(3):
+                jar[r] = kin.load(ck.a, here.row, 2 * NV + 4 * (ROOM * here.lane + s) + 1 + r, here.e)
+            f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
+            w = in_frame(E, point_velocity(node.W, p))
+            velocity = in_frame(E, point_velocity(link.V, p))
+            g_jar = H * w
+            g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
+            if wp.static(VARIED):
+                by_k = T(0.5) * coef[1] * wp.dot(g_jar, velocity) + g_jar[2] * state[2]
+                by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
+                adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
+                adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
+                adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
+            if wp.static(LEARNED):
+                by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
+                adj_factors[COLUMNS + 2 * c] = adj_factors[COLUMNS + 2 * c] - by_mu
+                adj_factors[COLUMNS + 2 * c + 1] = adj_factors[COLUMNS + 2 * c + 1] + wp.dot(f, w)
+            if wp.static(FRAMED):  # adjoint of a rotation of the frame
+                g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
+            if wp.static(PYRAMID):
+                g_turn = cone.frame(heading) * g_turn
+                g_heading = g_turn[2] * cone.heading_derivative(heading)
+                adj.p = adj.p + sp.join(in_world(feature, g_heading), vec3())
+                g_turn = g_turn - g_heading
+            f = in_world(E, f)
+            g_jar = in_world(E, g_jar)
+            G = force_at(p, g_jar)
+            wrench = force_at(p, f)
+            spin = wp.spatial_top(node.B) + coef[1] * wp.spatial_top(link.V)
+            g_p = wp.cross(g_jar, spin) - wp.cross(f, wp.spatial_top(node.W))
+            adj.w = adj.w - wrench
+            adj.v = adj.v + coef[1] * G
+            adj.b = adj.b + G
+            # The point follows the sphere's centre, at half its speed along the normal, which turns with it.
+            g_p = in_frame(feature, g_p)
+            g_p[2] = T(0.5) * g_p[2] + g_r
+            if wp.static(TERRAIN):
+                arm = T(m.contact_radius[c]) + T(0.5) * distance
+                g_p[0] = g_p[0] + curvature * (g_turn[1] - arm * g_p[0])
+            adj.p = adj.p + force_at(centre, in_world(feature, g_p))
+            adj.p = adj.p + wp.spatial_cross_dual(coef[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
+            s = s + 1
+            c = recorded_sphere(here, s, ck)
+        return adj, s
 
     @wp.func
     def limit_row(m: Model, here: Lane, i: int, q: T):

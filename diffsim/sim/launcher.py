@@ -13,6 +13,7 @@ import warp as wp
 
 from diffsim import startup
 from diffsim.kernels.backward import backward_kernel
+from diffsim.kernels.constraint import contact_columns
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import Division, divide
 from diffsim.kernels.model import model_of, types
@@ -124,11 +125,11 @@ class Launcher:
     def checkpoints(self, count: int) -> Any:
         """Allocate the kernels' struct Checkpoint for `count` substeps.
 
-        With MuJoCo's constraints it also holds the acceleration before damping and jar of all contacts, and the factors
-        of both solves if damping follows the constraints.
+        With MuJoCo's constraints it also holds the acceleration before damping, the contacts, and the factors of both
+        solves if damping follows the constraints.
         """
         spec, n, result = self.spec, self.num_envs, types(self.spec).Checkpoint()
-        accelerations = 2 * spec.nv + 3 * (self.scene.ncontact + spec.pairs) if spec.constrained else spec.nv
+        accelerations = 2 * spec.nv + contact_columns(spec) if spec.constrained else spec.nv
         widths = (spec.nq, spec.nv, accelerations, spec.nfactor)
         counts = (count, count, count, spec.solves * count)
         numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
