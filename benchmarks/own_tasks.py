@@ -1,7 +1,10 @@
-"""How often policies of examples with contact between bodies reach their aim in MuJoCo, on any file of their robot.
+"""How well policies of examples with contact between bodies reach their aim in MuJoCo, on any file of their robot.
 
     python benchmarks/own_tasks.py runs/get_up__rpo__1 --own examples/get_up.py --file path/to/unitree_g1/scene.xml
-    python benchmarks/own_tasks.py runs/dribble__rpo__1 --own examples/dribble.py --update-results
+    python benchmarks/own_tasks.py runs/cassie__rpo__1 --own examples/cassie.py --update-results
+
+A task's `achieved` tells whether a state is the aim; its `error` is a vector by which a state misses what the policy
+follows. That of an episode is the length of its mean over the second half, in which the swing of a gait cancels.
 
 Episodes begin as in training, without a robot that is lighter. The file's own collisions, friction and timestep act.
 What the task adds, servos and a ball, is added to the file.
@@ -23,7 +26,7 @@ import torch
 from common import ABOUT, Part, load_case, measured, run
 from joystick import training
 from tables import Row
-from worlds import MuJoCo, State, in_double, rollout
+from worlds import MuJoCo, State, Step, in_double, rollout
 
 from diffsim import load_scene
 from diffsim.training import Count, fail
@@ -38,13 +41,15 @@ class Args(common.CheckpointFlags):
 
 
 def measure(args: Args, path: Path) -> Iterator[Row]:
-    """The only row: shares of episodes that reach the aim, are there at the end and fall; seconds until the aim."""
+    """The only row: how well the aim is reached or followed, the share of episodes that fall, how actions change."""
     case = load_case(path, 1, "cpu", args.own)
     if args.file and not args.file.is_file():
         fail(f"no such file: {args.file}; MuJoCo Menagerie is at github.com/google-deepmind/mujoco_menagerie")
     task: Any = in_double(case.env)
-    if not hasattr(task, "achieved"):
+    if not (hasattr(task, "achieved") or hasattr(task, "error")):
         fail(f"{args.own} does not say what its policies should achieve")
+    if args.file and not hasattr(task, "prepare"):
+        fail(f"{args.own} has no `prepare`, which puts on --file what the task adds")
     scene = load_scene(task.prepare(mujoco.MjSpec.from_file(str(args.file)))) if args.file else case.env.scene
     n, drawn = args.episodes, torch.Generator().manual_seed(SEED)
     rand = torch.rand(n, task.num_random, generator=drawn, dtype=torch.float64)
@@ -53,20 +58,35 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     start = State(qpos, qvel, rand.new_zeros(n, scene.nu), task.begin(rand))
     world = MuJoCo(scene, n, task.control_dt, own_friction=True)
     steps = list(rollout(world, task, case.saved.network, start, task.episode_length))
-    there = torch.stack([task.achieved(step.state.qpos, step.state.memory) for step in steps]).numpy()
-    reached = there.any(0)
-    seconds = task.control_dt * (1 + there.argmax(0))[reached]
     change = torch.stack([b.state.action - a.state.action for a, b in zip(steps, steps[1:], strict=False)])
     yield training(case) | {
         "file": args.file.parent.name if args.file else "",
-        "reached": reached.mean(),
-        "seconds": np.median(seconds) if reached.any() else "",
-        "slowest": seconds.max() if reached.any() else "",
-        "at the end": there[-1].mean(),
+        **(aim(task, steps) if hasattr(task, "achieved") else {}),
+        **(errors(task, steps) if hasattr(task, "error") else {}),
         "fallen": steps[-1].fallen.double().mean().item(),
         "action change": change.abs().mean().item(),
         "episodes": n,
     }
+
+
+def aim(task: Any, steps: list[Step]) -> Row:
+    """Shares of episodes that reach the aim and are there at the end; seconds until the aim."""
+    there = torch.stack([task.achieved(step.state.qpos, step.state.memory) for step in steps]).numpy()
+    reached = there.any(0)
+    seconds = task.control_dt * (1 + there.argmax(0))[reached]
+    return {
+        "reached": reached.mean(),
+        "seconds": np.median(seconds) if reached.any() else "",
+        "slowest": seconds.max() if reached.any() else "",
+        "at the end": there[-1].mean(),
+    }
+
+
+def errors(task: Any, steps: list[Step]) -> Row:
+    """The median and the largest error of episodes without a fall."""
+    late = [task.error(*step.state[:2], step.state.memory) for step in steps[len(steps) // 2 :]]
+    found = torch.stack(late).mean(0).norm(dim=-1)[~steps[-1].fallen].numpy()
+    return {"error": np.median(found) if len(found) else "", "worst error": found.max() if len(found) else ""}
 
 
 def main(args: Args) -> None:

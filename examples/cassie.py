@@ -1,6 +1,7 @@
 """Agility's Cassie, whose legs are closed chains of rods and springs, walks at a commanded speed; docs/tasks.md.
 
 python rpo.py --env examples/cassie.py --horizon 16 --adjoint-clip 5 --initial-log-std -2 --iterations 200
+python benchmarks/own_tasks.py runs/<run> --own examples/cassie.py
 python -m diffsim export runs/<run>/checkpoint.pt cassie.onnx --env examples/cassie.py
 python examples/cassie.py cassie.onnx
 """
@@ -113,6 +114,10 @@ class Cassie(Task):
     def terminated(self, obs: Tensor) -> Tensor:
         """Tilted by more than 53 degrees, or low."""
         return (obs[..., 6] > -0.6) | (obs[..., 0] < 0.7)
+
+    def error(self, qpos: Tensor, qvel: Tensor, memory: Tensor) -> Tensor:
+        """Return the velocities along and across the course (..., 2) less the commanded ones."""
+        return torch.cat((qvel[..., :1] - memory[..., :1], qvel[..., 1:2]), dim=-1)
 
 
 if __name__ == "__main__":

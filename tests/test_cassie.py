@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
 
 import numpy as np
+import own_tasks
 import pytest
 import test_constraint
 import torch
 from cassie import Cassie
-from learners import ROOT
+from learners import ROOT, refusal
 from own_quadruped import play
+from tables import read_csv
 from test_constraint import H, check_gradients, in_mujoco, step
 from test_pairs import needs_drift
 
@@ -99,6 +102,16 @@ def test_the_image_moves_like_the_robot(folder: Path) -> None:
     assert abs(mirror.obs(obs) - obs).max() > 0.1
 
 
+@pytest.mark.parametrize("folder", ["likeness"], indirect=True)
+def test_the_error_is_that_of_speed_and_course(folder: Path) -> None:
+    task = Cassie(dtype=torch.float64)
+    memory = task.begin(torch.tensor([0.7, *(0.0,) * 66], dtype=torch.float64)).expand(2, -1)
+    qvel = torch.zeros(2, 32, dtype=torch.float64)
+    qvel[:, :3] = torch.tensor([[0.7, 0.0, 3.0], [0.5, -0.1, 3.0]])
+    error = task.error(torch.zeros(2, 35), qvel, memory)
+    torch.testing.assert_close(error, torch.tensor([[0.0, 0.0], [-0.2, -0.1]]).double(), rtol=0, atol=1e-7)
+
+
 @needs_drift
 def test_a_rollout_is_that_of_mujoco(folder: Path, rng: np.random.Generator) -> None:
     """With servos on the motors and feet on the ground, over 100 substeps; its gradients are those of differences."""
@@ -113,8 +126,8 @@ def test_a_rollout_is_that_of_mujoco(folder: Path, rng: np.random.Generator) -> 
 
 
 @pytest.mark.slow
-def test_a_policy_moves_in_mujoco_as_here(folder: Path) -> None:
-    """After an iteration of training, exported, with the time step of MuJoCo's file."""
+def test_a_policy_moves_in_mujoco_as_here(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """After an iteration of training, exported, with the time step of MuJoCo's file. It is judged there, too."""
     pytest.importorskip("onnxruntime")
     small = (
         "--num-envs 4 --horizon 4 --iterations 1 --eval-episodes 2 --eval-every 0 --device cpu --run-dir run".split()
@@ -129,3 +142,8 @@ def test_a_policy_moves_in_mujoco_as_here(folder: Path) -> None:
             obs, *_ = env.step(policy(obs))
     distance = play("cassie.onnx", Cassie(), seconds=0.3)
     assert distance == pytest.approx(env.qpos[0, 0].item(), abs=1e-3) and abs(distance) > 1e-3
+    args = own_tasks.Args(checkpoints=(Path("run"),), own=EXAMPLE, episodes=2, output=folder, device="cpu")
+    own_tasks.main(args)
+    (row,) = read_csv(folder / "own_tasks.csv")
+    assert row["episodes"] == "2" and (row["error"] == "") == (float(row["fallen"]) == 1.0)
+    assert "prepare" in refusal(lambda: own_tasks.main(dataclasses.replace(args, file=FILE)), capsys)

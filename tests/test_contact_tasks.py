@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import dribble
 import get_up
@@ -17,6 +18,7 @@ import torch
 from learners import ROOT
 from tables import read_csv
 from test_constraint import in_mujoco, step
+from worlds import State, Step
 
 import diffsim
 import rpo
@@ -111,6 +113,18 @@ def test_legs_touch_in_one_robot_and_not_in_the_other() -> None:
     whole, ghost = self_contact.Whole(), self_contact.Ghost()
     assert len(whole.scene().geom_pairs) == 16 and not ghost.scene().geom_pairs
     assert whole.obs_dim == ghost.obs_dim == self_contact.G1.obs_dim - 1
+
+
+def test_an_error_is_that_of_the_mean_of_the_second_half() -> None:
+    """Of those that do not fall: what swings cancels, what is off for good does not."""
+    off = torch.zeros(8, 4, 2).double()
+    off[:4], off[4::2, 0], off[5::2, 0], off[4:, 1], off[4:, 3, 1] = 9.0, 1.0, -1.0, torch.tensor([0.3, 0.4]), 0.1
+    fallen, nothing = torch.tensor([False, False, True, False]), torch.zeros(4, 0)
+    steps = [Step(State(rows, nothing, nothing, nothing), nothing, nothing, fallen) for rows in off]
+    task = SimpleNamespace(error=lambda qpos, qvel, memory: qpos)
+    assert own_tasks.errors(task, steps) == pytest.approx({"error": 0.1, "worst error": 0.5})
+    none = [step._replace(fallen=torch.ones(4, dtype=torch.bool)) for step in steps]
+    assert own_tasks.errors(task, none) == {"error": "", "worst error": ""}
 
 
 @pytest.mark.slow
