@@ -13,7 +13,7 @@ import pytest
 import test_constraint
 import torch
 from scenes import free_states, parse, pendulum, random_tree, robot
-from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, step
+from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, mujoco_model, step
 from test_gradient import gradients, weights
 
 from diffsim.extra.report import approximations, report
@@ -71,7 +71,7 @@ def tied_states(scene, number, rng):
 
 
 @needs_drift
-@pytest.mark.parametrize("base, seeds", [("floating", 3), *(pytest.param(base, 10, marks=SLOW) for base in ROOTS)])
+@pytest.mark.parametrize("base, seeds", [("floating", 1), *(pytest.param(base, 10, marks=SLOW) for base in ROOTS)])
 def test_trees_step_as_in_mujoco(base, seeds, rng):
     """Far from where their constraints would be satisfied, in motion."""
     errors = []
@@ -218,8 +218,10 @@ def model_as_it_is(scene):
     return m
 
 
+MODELS = model_as_it_is, mujoco_model  # in the latter the robot's parts pass through each other
+
 # Each has kernels of its own
-TANGLES = [("floating", "elliptic", 2), *(pytest.param(*each, 10, marks=SLOW) for each in product(TANGLED, CONES))]
+TANGLES = [("floating", "elliptic", 1), *(pytest.param(*each, 10, marks=SLOW) for each in product(TANGLED, CONES))]
 
 
 @needs_drift
@@ -239,7 +241,7 @@ def test_robots_that_touch_themselves_step_as_in_mujoco(base, cone, seeds, rng):
 
 def check_gradients_of_touching(scene, states, rng):
     """Compare gradients with differences in the six calmest states in which something touches."""
-    ends, apart = (step(each, states, 4)[1] for each in (scene, dataclasses.replace(scene, geom_pairs=())))
+    ends, apart = (in_mujoco(scene, *states, substeps=4, model=make(scene))[1] for make in MODELS)
     touches = abs(ends - apart).max(1) > 1e-3
     calm = np.argsort(np.where(touches, abs(ends).max(1), np.inf))[:6]
     assert touches[calm].all()
@@ -249,7 +251,7 @@ def check_gradients_of_touching(scene, states, rng):
 @pytest.mark.parametrize("base, cone, seeds", TANGLES)
 def test_gradient_through_contact_is_that_of_differences(base, cone, seeds, rng):
     """Where nothing is thrown about, as above."""
-    for seed in range(min(3, seeds // 2)):
+    for seed in range(min(3, seeds)):
         scene, states = tangled(base, cone, seed, 96, rng)
         check_gradients_of_touching(scene, states, rng)
 
@@ -343,7 +345,7 @@ def test_fixed_geoms_are_touched_as_in_mujoco(cone, rng):
     for each, model in cases:
         expected, found = in_mujoco(scene, *states, model=model)[1], step(each, states)[1]
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
-        touched = (abs(found - step(dataclasses.replace(scene, geom_pairs=()), states)[1]).max(1) > 1e-3).sum()
+        touched = (abs(found - in_mujoco(scene, *states)[1]).max(1) > 1e-3).sum()  # with the ground alone
     assert "ground at z = 0 m, 36 pairs of geoms" in report(scene)
     assert len(scene.geom_pairs) == 4 * 6 + 4 + 8 and len(whole.geom_pairs) == 36 + 12 and touched > n / 2
     check_gradients(scene, [x[:6] for x in states], rng)
