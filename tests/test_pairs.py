@@ -137,17 +137,27 @@ FOUR_BAR = """
 </mujoco>"""
 
 
+def linkages(rng):
+    scene, n = parse(FOUR_BAR), 8
+    return scene, (np.zeros((n, scene.nq)), np.zeros((n, scene.nv)), rng.uniform(-1, 1, (n, 2)))
+
+
 @needs_drift
 def test_a_four_bar_linkage_turns_as_in_mujoco(rng):
     """Over 100 substeps, and its loop stays closed."""
-    scene, n = parse(FOUR_BAR), 8
-    states = np.zeros((n, scene.nq)), np.zeros((n, scene.nv)), rng.uniform(-1, 1, (n, 2))
+    scene, states = linkages(rng)
     qpos, qvel, residual = step(scene, states, 100)
     expected, velocity, _ = in_mujoco(scene, *states, substeps=100)
     assert residual.max() < 1e-10 and abs(qpos[:, 0]).max() > 0.3
     np.testing.assert_allclose(qpos, expected, atol=1e-8)
     np.testing.assert_allclose(qvel, velocity, atol=1e-6)
     np.testing.assert_allclose(qpos[:, 3], qpos[:, 4], atol=1e-3)
+
+
+@SLOW
+def test_gradient_of_a_four_bar_linkage_is_that_of_differences(rng):
+    scene, states = linkages(rng)
+    qpos, qvel, _ = step(scene, states, 100)
     check_gradients(scene, (qpos, qvel, states[2]), rng)
 
 

@@ -210,6 +210,7 @@ SINGLE = {
     "elliptic cone, large impratio": {"option": 'cone="elliptic" impratio="1e6"'},
     "position servo with kv, Euler": {"actuator": SERVO.format("position", 'kp="20" kv="2" ctrlrange="-1 1"')},
     "velocity servo, Euler": {"actuator": SERVO.format("velocity", 'kv="2" ctrlrange="-1 1"')},
+    "explicit dampers": {"flag": 'eulerdamp="disable"'},
     "RK4": {"option": 'integrator="RK4"', "expected": "Left out: integrator RK4"},
     "noslip": {"option": 'noslip_iterations="10"', "expected": "Left out: noslip_iterations"},
     "PGS": {"option": 'solver="PGS" iterations="5"', "expected": "Left out: a solver that may stop"},
