@@ -3,12 +3,13 @@ from __future__ import annotations
 import gc
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from browser import CHROMIUM, Browser
 
 import shac
@@ -31,6 +32,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("gpu"):
                 item.add_marker(pytest.mark.skip(reason="needs a CUDA GPU, and PyTorch sees none"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, bool | None, bool | None]:
+    """Compile the kernels of tests marked so in a quarter of the time; they run at a fifth of the speed."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("unoptimized"):
+            patch.setattr(wp.config, "optimization_level", 0)
+        return (yield)
 
 
 def pytest_collection_finish() -> None:

@@ -185,6 +185,7 @@ def test_tree_steps_are_mujocos(base, seed, rng):
     assert check_step(scene, states, 1.0) == kinds_of_states(seed)
 
 
+@pytest.mark.unoptimized
 def test_pairs_and_meshes_touch_as_in_mujoco(rng):
     """A <pair> has its own friction, time constants, impedance and margin; a frictionless mesh touches beside it."""
     numbers = 'condim="3" friction="0.4 0.4" solref="-900 -40" solimp="0.7 0.95 0.01 0.4 2" margin="0.03"'
@@ -685,6 +686,7 @@ def test_frictionless_contact_and_friction_of_zero():
         step(pyramidal, states, dtype=torch.float32)
 
 
+@pytest.mark.unoptimized
 @pytest.mark.parametrize(("dtype", "enough"), [(torch.float64, 1e-9), pytest.param(torch.float32, 1e-5, marks=SLOW)])
 def test_a_turntable_in_the_ground_turns_as_in_mujoco(dtype, enough):
     """A link that turns about its centre of mass has an inverse weight of zero."""

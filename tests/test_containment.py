@@ -56,6 +56,7 @@ def test_simulator_contains_what_is_not_finite(name, integration, where, value, 
     assert not sim.nonfinite.any()
 
 
+@pytest.mark.unoptimized
 def test_a_control_that_is_not_a_number_is_contained_where_forces_are_bounded(rng):
     """min and max would make a bound of it."""
     scene = parse(BOUNDED_SERVOS)
@@ -70,6 +71,7 @@ def test_a_control_that_is_not_a_number_is_contained_where_forces_are_bounded(rn
 BALLS = BALL.replace('mass="2"/>', 'mass="2"/> <body> <joint type="ball" stiffness="1"/> <geom size="0.1"/> </body>')
 
 
+@pytest.mark.unoptimized
 @pytest.mark.parametrize(
     ("joint", "length", "spring"),
     [

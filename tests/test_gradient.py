@@ -107,7 +107,7 @@ def test_tree_gradient_is_that_of_differences(base, seed, rng):
     check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, integration=Integration(substeps=16))
 
 
-@pytest.mark.parametrize("implicit", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ball_joint_gradient_is_that_of_differences(implicit, rng):
     """Quaternions of any length and sign, and one turn of nothing, where the spring's rotation vector is zero."""
     scene = parse(SHOULDER)
@@ -117,7 +117,7 @@ def test_ball_joint_gradient_is_that_of_differences(implicit, rng):
     check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(implicit=implicit))
 
 
-@pytest.mark.parametrize("name", ["muscles", "fluid"])
+@pytest.mark.parametrize("name", ["fluid", pytest.param("muscles", marks=pytest.mark.slow)])
 def test_gradient_of_small_robots_is_that_of_differences(name, rng):
     scene = small_scene(name)
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))

@@ -461,6 +461,7 @@ def test_a_stack_of_boxes_rests_as_in_mujoco():
     np.testing.assert_allclose(qpos.reshape(4, 7)[:, 2], scene.qpos0.reshape(4, 7)[:, 2], atol=2e-3)
 
 
+@pytest.mark.unoptimized
 def test_other_shapes_touch_as_their_capsules(rng):
     """Which MuJoCo has in their place here."""
     arms = ""

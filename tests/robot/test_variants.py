@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from scenes import free_states, parse, random_tree, robot
 
@@ -17,6 +16,7 @@ from diffsim.extra.report import approximations
 from diffsim.robot.constraint import constrained
 from diffsim.sim import simulator
 
+pytestmark = pytest.mark.unoptimized
 States: TypeAlias = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # qpos and qvel
 H = 0.002  # s
 BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
@@ -170,7 +170,6 @@ def step_error(scene: Scene, states: States) -> float:
     m.opt.timestep = H
     qpos, qvel = (torch.tensor(np.array(x)) for x in zip(*states, strict=True))
     with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wp.config, "optimization_level", 0)  # each robot's kernel takes one step
         patch.setattr(simulator, "PASSES", 300)
         sim = Simulator(scene, count, Integration("mujoco", 1, tolerance=1e-12), H, dtype=torch.float64)
         found = sim.step(qpos, qvel, torch.full((count, m.nu), 0.3, dtype=torch.float64))[1].numpy()
