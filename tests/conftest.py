@@ -28,6 +28,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         commands = item.path.parent.name == "benchmarks" and item.path.name != "test_tables.py"
         if commands and "tmp_path" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.slow)
+    # First, because what one process takes from another's end would include them, and each would train the ranks.
+    items.sort(key=lambda item: item.path.name != "test_distributed.py")
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("gpu"):
