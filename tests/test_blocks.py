@@ -80,7 +80,7 @@ def step(scene, states, dtype, integration, weights=None, **options):
         pytest.param("leg", SEMI, {"factors": True}, marks=pytest.mark.slow),
         pytest.param("hopper on hills", SEMI, {}, marks=pytest.mark.slow),
         pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),
-        ("ball on hills", MUJOCO, {}),
+        pytest.param("ball on hills", MUJOCO, {}, marks=pytest.mark.slow),
         ("bar on hills", MUJOCO, {"factors": True}),
     ],
 )

@@ -11,7 +11,7 @@ from scenes import (
     BALL,
     BOUNDED_SERVOS,
     COMPENSATED,
-    DISTINCT_CASES,
+    DISTINCT,
     SHOULDER,
     acting_states,
     check_that_ground_and_limits_act,
@@ -84,7 +84,11 @@ def check_gradients(scene, states, rng, optional=None, **simulator):
             assert (error <= 1e-6 * size).all() and size.any(), f"gradient with respect to {name}"
 
 
-@pytest.mark.parametrize("name, implicit", DISTINCT_CASES)
+# test_factors.py has those of an implicit leg with muscles.
+@pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "humanoid_mtu")) for name in DISTINCT]
+)
 def test_task_gradient_is_that_of_differences(name, implicit, rng):
     scene = task_scene(name)
     states = acting_states(scene, 8, rng)

@@ -93,31 +93,6 @@ def test_tree_gradient_is_that_of_differences(base, rng):
     check_gradients(scene, [x[calm] for x in states], rng)
 
 
-@pytest.mark.parametrize("block", [pytest.param(1, marks=SLOW), 8])
-def test_single_precision_is_near(block, rng):
-    scene = tied_tree("floating", 0)
-    states, w = tied_states(scene, 9, rng), weights(scene, rng)
-    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=block)
-    assert residual.max() < 1e-4
-    expected = step(scene, states, 4)[1]
-    assert abs(qvel - expected).max() < 1e-4 * abs(expected).max()
-    found, exact = (
-        np.concatenate(gradients(scene, states, w, dtype, control_dt=4 * H, integration=how, block=size), axis=1)
-        for dtype, how, size in (
-            (torch.float32, Integration("mujoco", 4), block),
-            (torch.float64, Integration("mujoco", 4, tolerance=1e-11), 1),
-        )
-    )
-    assert np.linalg.norm(found - exact) < 1e-2 * np.linalg.norm(exact)
-
-
-def test_neighbours_do_not_change_an_environment(rng):
-    scene = tied_tree("floating", 0)
-    states = tied_states(scene, 8, rng)
-    states[1][::2] *= 100.0
-    check_neighbours(scene, states)
-
-
 # A crank and a rocker, whose coupler closes the loop at sites, and a gripper whose fingers mirror each other.
 FOUR_BAR = """
 <mujoco> <option timestep="0.002"/>
@@ -138,10 +113,43 @@ FOUR_BAR = """
 
 
 def linkages(rng):
-    scene, n = parse(FOUR_BAR), 8
-    return scene, (np.zeros((n, scene.nq)), np.zeros((n, scene.nv)), rng.uniform(-1, 1, (n, 2)))
+    """Nine in motion."""
+    scene = parse(FOUR_BAR)
+    return scene, (np.zeros((9, scene.nq)), 0.1 * rng.normal(size=(9, scene.nv)), rng.uniform(-1, 1, (9, 2)))
 
 
+@pytest.mark.unoptimized
+@pytest.mark.parametrize(
+    "name, block", [("four-bar", 8), *(pytest.param("tree", block, marks=SLOW) for block in (1, 8))]
+)
+def test_single_precision_is_near(name, block, rng):
+    scene, states = (
+        linkages(rng) if name == "four-bar" else ((tree := tied_tree("floating", 0)), tied_states(tree, 9, rng))
+    )
+    w = weights(scene, rng)
+    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=block)
+    assert residual.max() < 1e-4
+    expected = step(scene, states, 4)[1]
+    assert abs(qvel - expected).max() < 1e-4 * abs(expected).max()
+    found, exact = (
+        np.concatenate(gradients(scene, states, w, dtype, control_dt=4 * H, integration=how, block=size), axis=1)
+        for dtype, how, size in (
+            (torch.float32, Integration("mujoco", 4), block),
+            (torch.float64, Integration("mujoco", 4, tolerance=1e-11), 1),
+        )
+    )
+    assert np.linalg.norm(found - exact) < 1e-2 * np.linalg.norm(exact)
+
+
+@pytest.mark.unoptimized
+def test_neighbours_do_not_change_an_environment(rng):
+    scene, states = linkages(rng)
+    states = [x[:8] for x in states]
+    states[1][::2] *= 100.0
+    check_neighbours(scene, states)
+
+
+@pytest.mark.unoptimized
 @needs_drift
 def test_a_four_bar_linkage_turns_as_in_mujoco(rng):
     """Over 100 substeps, and its loop stays closed."""
@@ -301,24 +309,35 @@ def marbles(cone, seed):
     return parse(f'<mujoco><option cone="{cone}"/><worldbody> {bodies} </worldbody></mujoco>')
 
 
+def marble_states(scene, number, rng):
+    qpos, qvel, ctrl = free_states(scene, number, rng)
+    qpos.reshape(number, 3, 7)[..., :3] = 0.1 * rng.normal(size=(number, 3, 3))
+    return qpos, 0.3 * qvel, ctrl
+
+
+@pytest.mark.unoptimized
 @pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
 def test_spheres_touch_boxes_as_in_mujoco(cone, rng):
-    """At faces, edges and corners, and with their centres inside; gradients are those of differences."""
+    """At faces, edges and corners, and with their centres inside."""
     depths = []
     for seed in range(10):
-        scene, n = marbles(cone, seed), 32
-        qpos, qvel, ctrl = free_states(scene, n, rng)
-        qpos.reshape(n, 3, 7)[..., :3] = 0.1 * rng.normal(size=(n, 3, 3))
-        states, model = (qpos, 0.3 * qvel, ctrl), model_as_it_is(scene)
+        scene = marbles(cone, seed)
+        states, model = marble_states(scene, 32, rng), model_as_it_is(scene)
         expected, found = in_mujoco(scene, *states, model=model)[1], step(scene, states)[1]
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
         data = mujoco.MjData(model)
-        for each in qpos:
-            data.qpos = each
+        for qpos in states[0]:
+            data.qpos = qpos
             mujoco.mj_fwdPosition(model, data)
             depths += [-contact.dist / model.geom_size[max(contact.geom), 0] for contact in data.contact]
     assert min(depths) < 0.2 and max(depths) > 1.2  # in radii
-    check_gradients(scene, [x[:8] for x in states], rng)
+
+
+@SLOW
+@pytest.mark.parametrize("cone", CONES)
+def test_gradient_of_spheres_on_boxes_is_that_of_differences(cone, rng):
+    scene = marbles(cone, 9)
+    check_gradients(scene, marble_states(scene, 8, rng), rng)
 
 
 def crawler(cone):
