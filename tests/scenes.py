@@ -11,7 +11,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import pytest
 import reference
 import torch
 from numpy.typing import NDArray
@@ -29,11 +28,6 @@ SOFT = [name for name, task in TASKS.items() if task.contact == "soft"]  # on th
 ROBOTS = [name for name in SOFT if TASKS[name].asset == f"{name}.xml"]  # one task of each
 # Together these have every feature of a task's robot: a kernel takes seconds to compile.
 DISTINCT = ("half_cheetah", "humanoid", "humanoid_mtu", "swimmer")
-DISTINCT_CASES = [
-    pytest.param(name, implicit, marks=[pytest.mark.slow] * (name != "half_cheetah" and implicit))
-    for implicit in (False, True)
-    for name in DISTINCT
-]
 
 # A free sphere of 2 kg; it falls, rolls, slides and rests.
 BALL = """

@@ -29,7 +29,7 @@ both_integrators = pytest.mark.parametrize("implicit", [False, True])
 # Presets
 
 
-HEAVY = "cartpole", "half_cheetah", "ant", "humanoid_mtu"  # whose kernels no other test needs
+HEAVY = "cartpole", "half_cheetah", "ant", "humanoid", "humanoid_mtu"  # whose kernels no other test needs
 
 
 @pytest.mark.parametrize(

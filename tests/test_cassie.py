@@ -82,6 +82,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.M
     return folder
 
 
+@pytest.mark.unoptimized
 @torch.no_grad()
 @pytest.mark.parametrize("folder", ["likeness"], indirect=True)
 def test_the_image_moves_like_the_robot(folder: Path) -> None:
@@ -91,7 +92,7 @@ def test_the_image_moves_like_the_robot(folder: Path) -> None:
     state, image = (env.qpos, env.qvel), (mirror.qpos(env.qpos), mirror.qvel(env.qvel))
     memory = task.begin(torch.rand(5, env.scene.nq + env.scene.nv, dtype=torch.float64, generator=env.generator))
     ahead = torch.cat((memory[:, :1], (memory[:, 1:2] + 0.5) % 1, memory[:, 2:]), dim=1)
-    for action in 2 * torch.rand(10, 5, 10, dtype=torch.float64, generator=env.generator) - 1:
+    for action in 2 * torch.rand(5, 5, 10, dtype=torch.float64, generator=env.generator) - 1:
         turned = mirror.action(action)
         state, image = sim.step(*state, action), sim.step(*image, turned)
         memory, ahead = task.remember(memory, action, memory), task.remember(ahead, turned, memory)
@@ -112,9 +113,10 @@ def test_the_error_is_that_of_speed_and_course(folder: Path) -> None:
     torch.testing.assert_close(error, torch.tensor([[0.0, 0.0], [-0.2, -0.1]]).double(), rtol=0, atol=1e-7)
 
 
+@pytest.mark.unoptimized
 @needs_drift
 def test_a_rollout_is_that_of_mujoco(folder: Path, rng: np.random.Generator) -> None:
-    """With servos on the motors and feet on the ground, over 100 substeps; its gradients are those of differences."""
+    """With servos on the motors and feet on the ground, over 100 substeps."""
     env = diffsim.make(EXAMPLE, 6, dtype=torch.float64)
     states = env.qpos.numpy(), env.qvel.numpy(), rng.uniform(-0.3, 0.3, (6, 10))
     qpos, qvel, residual = step(env.scene, states, 100)
@@ -122,7 +124,14 @@ def test_a_rollout_is_that_of_mujoco(folder: Path, rng: np.random.Generator) -> 
     assert residual.max() < 1e-10 and {"point_rows"} < constrained(env.scene, H).features
     np.testing.assert_allclose(qpos, expected, atol=1e-8)
     np.testing.assert_allclose(qvel, velocity, atol=1e-6)
-    check_gradients(env.scene, (qpos, qvel, states[2]), rng)
+
+
+@pytest.mark.slow
+def test_its_gradients_are_those_of_differences(folder: Path, rng: np.random.Generator) -> None:
+    env = diffsim.make(EXAMPLE, 6, dtype=torch.float64)
+    ctrl = rng.uniform(-0.3, 0.3, (6, 10))
+    qpos, qvel, _ = step(env.scene, (env.qpos.numpy(), env.qvel.numpy(), ctrl), 100)
+    check_gradients(env.scene, (qpos, qvel, ctrl), rng)
 
 
 @pytest.mark.slow

@@ -96,6 +96,7 @@ def test_the_gait_leads_behind_the_ball_then_to_its_place(field: Path) -> None:
     assert not task.achieved(qpos, memory).any() and task.achieved(qpos, qpos[:, 19:21]).all()
 
 
+@pytest.mark.unoptimized
 def test_a_ball_rolls_and_is_kicked_as_in_mujoco(field: Path, rng: np.random.Generator) -> None:
     scene = diffsim.make(DRIBBLE, 1).scene
     qpos, n = np.tile(scene.mj_model.key_qpos[0], (8, 1)), 8

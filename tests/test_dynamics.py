@@ -11,7 +11,7 @@ import reference
 import torch
 from scenes import (
     BOUNDED_SERVOS,
-    DISTINCT_CASES,
+    DISTINCT,
     ROBOTS,
     SMALL,
     acceleration,
@@ -28,12 +28,14 @@ from scenes import (
     without_ground,
 )
 
+from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
+SLOW, UNOPTIMIZED = pytest.mark.slow, pytest.mark.unoptimized
 TREES = [
-    pytest.param(base, seed, marks=[pytest.mark.slow] * (seed > 1))  # each compiles a kernel of its own
+    pytest.param(base, seed, marks=[SLOW] * (seed > 1 or base == "planar"))  # the cheetah is planar, too
     for base in ("floating", "fixed", "planar", "ball")
     for seed in range(4)
 ]
@@ -79,9 +81,11 @@ def test_task_accelerations_are_mujocos(name, rng):
     check_against_mujoco(task_scene(name), torch.float64, rng)
 
 
-@pytest.mark.parametrize("name, count", [("hopper", 64), ("ant", 64), ("humanoid_mtu", 15)])
+@pytest.mark.parametrize(
+    "name, count", [("hopper", 64), ("ant", 64), pytest.param("humanoid_mtu", 15, marks=UNOPTIMIZED)]
+)
 def test_accelerations_in_float32_are_mujocos(name, count, rng):
-    """In blocks of 16 or of 8, of which other tests compile the kernels."""
+    """In blocks of 16 or of 8."""
     check_against_mujoco(task_scene(name), torch.float32, rng, count)
 
 
@@ -90,7 +94,17 @@ def test_tree_accelerations_are_mujocos(base, seed, rng):
     check_against_mujoco(tree_scene(base, seed), torch.float64, rng)
 
 
-@pytest.mark.parametrize("name", SMALL)
+ALONE = "gravity compensation", "muscle on the world", "muscle by its maximum force"
+
+
+# Other tests have bounded servos, and muscles under forces.
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[SLOW] * (name in ("servos", "muscles")) + [UNOPTIMIZED] * (name in ALONE))
+        for name in SMALL
+    ],
+)
 def test_accelerations_of_small_robots_are_mujocos(name, rng):
     check_against_mujoco(small_scene(name), torch.float64, rng)
 
@@ -111,6 +125,7 @@ def bounded_servos(count, rng):
     return scene, (qpos, qvel, ctrl)
 
 
+@UNOPTIMIZED
 def test_bounds_of_actuators_are_mujocos(rng):
     """forcerange of an actuator, actuatorfrcrange of a joint with several, both, and of a motor that has no spring."""
     scene, states = bounded_servos(64, rng)
@@ -124,16 +139,17 @@ def test_bounds_of_actuators_are_mujocos(rng):
 # Against the plain NumPy reference
 
 
-def check_against_reference(scene, qpos, qvel, ctrl, substeps, implicit=False):
+def check_against_reference(scene, qpos, qvel, ctrl, substeps, implicit=False, **optional):
     """Over four of a control step's substeps: all are alike, and the reference is slow."""
     how = {"control_dt": 4 / substeps / 60, "integration": Integration("soft", 4, implicit)}
-    q, v = run(scene, qpos, qvel, ctrl, **how)
+    q, v = run(scene, qpos, qvel, ctrl, **how, **optional)
     expected = [reference.step(scene, *state, **how) for state in zip(qpos, qvel, ctrl, strict=True)]
     assert relative_error(q, np.array([e[0] for e in expected])) < 1e-10
     assert relative_error(v, np.array([e[1] for e in expected])) < 1e-10
 
 
-@pytest.mark.parametrize("name, implicit", DISTINCT_CASES)
+@pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=SLOW)])  # test_factors.py has an implicit leg
+@pytest.mark.parametrize("name", DISTINCT)
 def test_task_steps_are_the_references(name, implicit, rng):
     scene = task_scene(name)
     states = acting_states(scene, 3, rng)
@@ -153,15 +169,17 @@ def test_tree_steps_are_the_references(base, seed, rng):
 @pytest.mark.parametrize(
     "name, substeps, implicit",
     [
-        ("ball joint on the world", 4, True),
+        ("ball joint on the world", 4, False),
+        pytest.param("ball joint on the world", 4, True, marks=SLOW),
         ("gravity compensation", 4, True),
         ("fluid", 4, False),
-        ("muscles", 16, False),
+        pytest.param("muscles", 16, False, marks=SLOW),
     ],
 )
 def test_steps_of_small_robots_are_the_references(name, substeps, implicit, rng):
     scene = small_scene(name)
-    check_against_reference(scene, *free_states(scene, 4, rng), substeps, implicit)
+    ones = {"factors": np.ones((4, len(FACTORS)))} if name == "gravity compensation" else {}  # as its gradients have
+    check_against_reference(scene, *free_states(scene, 4, rng), substeps, implicit, **ones)
 
 
 # Laws of motion

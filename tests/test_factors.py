@@ -47,10 +47,11 @@ def grounded_leg(count, rng):
     return grounded_states(leg_scene(grounded=True), count, rng)
 
 
-@pytest.mark.parametrize("name", ["hopper", "tree"])
+@pytest.mark.parametrize("name", ["hopper", "leg", "tree"])
 def test_accelerations_under_forces_are_mujocos(name, rng):
-    """Of a robot on the world, where the factors are one, and of a tree."""
-    scene = without_ground(TREE if name == "tree" else task_scene(name))
+    """Of a robot on the world and of one with muscles, where the factors are one, and of a tree."""
+    scenes = {"hopper": task_scene("hopper"), "leg": leg_scene(grounded=True), "tree": TREE}
+    scene = without_ground(scenes[name])
     states, forces = free_states(scene, 64, rng), wrenches(scene, 64, rng)
     ones = {} if name == "tree" else {"factors": np.ones((64, len(FACTORS)))}
     qacc, expected = acceleration(scene, *states, forces=forces, **ones), mujoco_acceleration(scene, *states, forces)

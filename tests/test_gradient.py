@@ -11,7 +11,7 @@ from scenes import (
     BALL,
     BOUNDED_SERVOS,
     COMPENSATED,
-    DISTINCT_CASES,
+    DISTINCT,
     SHOULDER,
     acting_states,
     check_that_ground_and_limits_act,
@@ -84,7 +84,11 @@ def check_gradients(scene, states, rng, optional=None, **simulator):
             assert (error <= 1e-6 * size).all() and size.any(), f"gradient with respect to {name}"
 
 
-@pytest.mark.parametrize("name, implicit", DISTINCT_CASES)
+# test_factors.py has those of an implicit leg with muscles.
+@pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "humanoid_mtu")) for name in DISTINCT]
+)
 def test_task_gradient_is_that_of_differences(name, implicit, rng):
     scene = task_scene(name)
     states = acting_states(scene, 8, rng)
@@ -107,7 +111,7 @@ def test_tree_gradient_is_that_of_differences(base, seed, rng):
     check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, integration=Integration(substeps=16))
 
 
-@pytest.mark.parametrize("implicit", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ball_joint_gradient_is_that_of_differences(implicit, rng):
     """Quaternions of any length and sign, and one turn of nothing, where the spring's rotation vector is zero."""
     scene = parse(SHOULDER)
@@ -117,7 +121,7 @@ def test_ball_joint_gradient_is_that_of_differences(implicit, rng):
     check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(implicit=implicit))
 
 
-@pytest.mark.parametrize("name", ["muscles", "fluid"])
+@pytest.mark.parametrize("name", ["fluid", pytest.param("muscles", marks=pytest.mark.slow)])
 def test_gradient_of_small_robots_is_that_of_differences(name, rng):
     scene = small_scene(name)
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))

@@ -21,6 +21,7 @@ from diffsim.extra.commands import main as diffsim_main
 from diffsim.tasks.base import ASSETS
 from diffsim.training import checkpoint, load_policy, parse
 
+pytestmark = pytest.mark.unoptimized
 PAGE = (ROOT / "docs" / "own_robot.md").read_text()
 (LISTING,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 (MADE,) = re.findall(r"`(diffsim\.make\(.*?\))`", PAGE)

@@ -219,14 +219,14 @@ def test_an_option_makes_uneven_ground():
             diffsim.make(name, count, seed=seed)
 
 
-@pytest.mark.parametrize("name", ["walker:rough=20", "ant:friction=0.5:1.5"])
+@pytest.mark.parametrize("name", ["hopper:rough=20", "hopper:friction=0.5:1.5"])
 def test_gradient_of_a_window_with_options_is_that_of_differences(name, rng):
     """On slopes, away from the level start, and where each environment has its own friction; the robots touch ground.
 
     Of a weighted sum of observations and rewards with respect to all actions and velocities.
     """
     factors = "friction" in name
-    env = diffsim.make(name, 3, seed=3, horizon=3, dtype=torch.float64, contact="soft", factors=factors)
+    env = diffsim.make(name, 3, seed=3, horizon=3, dtype=torch.float64, contact="soft", factors=factors, forces=factors)
     env.early_termination = False
     if factors:
         Variation(env, 5).set(1)

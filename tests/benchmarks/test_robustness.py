@@ -26,6 +26,7 @@ from diffsim.training.checkpoint import POLICIES
 from diffsim.training.evaluation import SEED
 from diffsim.training.layers import Chain
 
+pytestmark = pytest.mark.unoptimized
 PUCK = """
 <mujoco>
   <option gravity="0 0 0"/>

@@ -26,6 +26,7 @@ def test_the_handful_asks_for_everything() -> None:
     assert all((m.actuator_biasprm[:, 2] < 0).all() for m in models)  # kv
 
 
+@pytest.mark.unoptimized
 @pytest.mark.parametrize("seed", [pytest.param(seed, marks=[pytest.mark.slow] * (seed != 4)) for seed in HANDFUL])
 def test_a_rollout_is_mujocos(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Step by step and as a whole. Where steps of the file differ, the check says why."""

@@ -16,6 +16,7 @@ from diffsim.extra.provenance import fingerprint
 from diffsim.tasks.base import ASSETS
 from diffsim.training.checkpoint import POLICIES
 
+pytestmark = pytest.mark.unoptimized
 ROBOT = """<mujoco>
   <worldbody>
     <geom type="plane" size="1 1 1"/>

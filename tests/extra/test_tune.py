@@ -16,9 +16,12 @@ from diffsim.extra.tune.extremes import first_failure
 from diffsim.extra.tune.front import Reference, Row, choice, front
 from diffsim.extra.tune.motion import Motion
 
+# Its damper and its limits do nothing, but so it shares the kernels of the tests' hinges.
 PENDULUM = """
-<mujoco><option gravity="0 0 -9.81"/><custom/><worldbody><body>
-  <joint axis="0 1 0" {joint}/>
+<mujoco><compiler angle="radian"/><option gravity="0 0 -9.81"/>
+<custom><numeric name="k_limit" data="300"/><numeric name="d_limit" data="200"/></custom>
+<worldbody><body>
+  <joint axis="0 1 0" range="-1e5 1e5" damping="1e-300" {joint}/>
   <geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05" mass="1" contype="0" conaffinity="0"/>
 </body></worldbody><actuator>{motor}</actuator></mujoco>"""
 MOTOR = '<motor joint="swing" gear="4" ctrlrange="-1 1"/>'
@@ -27,7 +30,7 @@ MOTOR = '<motor joint="swing" gear="4" ctrlrange="-1 1"/>'
 @pytest.fixture(scope="module")
 def pendulum(tmp_path_factory):
     path = tmp_path_factory.mktemp("tune") / "pendulum.xml"
-    path.write_text(PENDULUM.format(joint='name="swing" stiffness="0.1"', motor=MOTOR))  # the stiff one's kernels
+    path.write_text(PENDULUM.format(joint='name="swing" stiffness="0.1"', motor=MOTOR))
     return path
 
 

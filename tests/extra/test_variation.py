@@ -151,6 +151,7 @@ def test_disturbances_are_the_tasks() -> None:
     assert diffsim.make("go2", 1).task.disturbances["push"] == (0.0, 0.0)
 
 
+@pytest.mark.unoptimized
 def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scenes import free_states, parse, random_tree, robot
 
 from diffsim import Integration, Scene, SceneError, Simulator
-from diffsim.extra.commands import quick_kernels
 from diffsim.extra.report import approximations
 from diffsim.robot.constraint import constrained
 from diffsim.sim import simulator
 
+pytestmark = pytest.mark.unoptimized
 States: TypeAlias = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # qpos and qvel
 H = 0.002  # s
 BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
@@ -169,7 +169,7 @@ def step_error(scene: Scene, states: States) -> float:
     m, count = scene.mj_model, len(states)
     m.opt.timestep = H
     qpos, qvel = (torch.tensor(np.array(x)) for x in zip(*states, strict=True))
-    with quick_kernels(), torch.no_grad(), pytest.MonkeyPatch.context() as patch:
+    with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulator, "PASSES", 300)
         sim = Simulator(scene, count, Integration("mujoco", 1, tolerance=1e-12), H, dtype=torch.float64)
         found = sim.step(qpos, qvel, torch.full((count, m.nu), 0.3, dtype=torch.float64))[1].numpy()
@@ -209,6 +209,7 @@ SINGLE = {
     "elliptic cone, large impratio": {"option": 'cone="elliptic" impratio="1e6"'},
     "position servo with kv, Euler": {"actuator": SERVO.format("position", 'kp="20" kv="2" ctrlrange="-1 1"')},
     "velocity servo, Euler": {"actuator": SERVO.format("velocity", 'kv="2" ctrlrange="-1 1"')},
+    "explicit dampers": {"flag": 'eulerdamp="disable"'},
     "RK4": {"option": 'integrator="RK4"', "expected": "Left out: integrator RK4"},
     "noslip": {"option": 'noslip_iterations="10"', "expected": "Left out: noslip_iterations"},
     "PGS": {"option": 'solver="PGS" iterations="5"', "expected": "Left out: a solver that may stop"},
@@ -332,7 +333,7 @@ def test_single_feature_of_a_box(box: tuple[float, float, float, str]) -> None:
 # Random robots whose servos have kv -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=[pytest.mark.slow] * (seed > 5)) for seed in range(10)])
 def test_random_robot_with_kv(seed: int) -> None:
     """Floating, on a hinge or on two slides; stepped by Euler or by implicitfast, half of them with a forcerange."""
     base, integrator = ("floating", "fixed", "planar")[seed % 3], ("Euler", "implicitfast")[seed // 3 % 2]

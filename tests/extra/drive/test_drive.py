@@ -193,6 +193,7 @@ def test_each_command_moves_the_robot_its_way():
         assert moved[1] > 0.2, "pulled to the left"
 
 
+@pytest.mark.unoptimized
 def test_a_clip_is_played_from_its_beginning_beside_its_ghost_and_again_after_its_end() -> None:
     env = diffsim.make("g1_track:g1_jazz_walk", 1, forces=True)
     bodies, pilot = env.scene.nbody, Pilot(env, lambda obs: torch.zeros(len(obs), 29))
