@@ -34,15 +34,16 @@ from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
 from diffsim.kernels.wide import blocks
 
-# Contacts of a lane with the ground at once, on a GPU and on a CPU, where a block unites those of its environments. A
+# All points of a lane may touch the ground at once on a CPU, a share of them on a GPU, and MOST_CONTACTS in any case. A
 # GPU's compiler writes out how each element of a local array begins: for the 456 points of a G1's meshes in a minute.
-MOST_CONTACTS = 64, 128
+MOST_CONTACTS = 64
+SHARES = 1, 4  # on a CPU, whose blocks unite the contacts of environments, and on a GPU
 UNSOLVED = 1e8  # square of the acceleration by which a step is wrong that lacks a contact for want of room
 
 
 def contact_room(spec: KernelSpec) -> int:
     """Return how many contacts with the ground have room."""
-    return max(1, min(spec.spheres, MOST_CONTACTS[not spec.env_last]))
+    return max(1, min(spec.spheres, max(MOST_CONTACTS, spec.spheres // SHARES[spec.env_last])))
 
 
 def contact_columns(spec: KernelSpec) -> int:
