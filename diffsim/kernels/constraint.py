@@ -150,14 +150,13 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                         s = number
                         if wp.static(PYRAMID):
                             E = E * cone.frame(cone.heading(m, c, links[i].R, E))
-                        while last < end and contacts[wp.min(last, ROOM - 1)].last_sphere < c:
+                        while last < end and contacts[last].last_sphere < c:
                             last = last + 1
                         sticking = T(1.0)
                         last_jar = vec3()
-                        if last < end:
-                            if contacts[last].last_sphere == c:
-                                sticking = T(1.0) - active * contacts[last].last_active
-                                last_jar = contacts[last].last_jar
+                        if last < end and contacts[last].last_sphere == c:
+                            sticking = T(1.0) - active * contacts[last].last_active
+                            last_jar = contacts[last].last_jar
                         p, jar, state, coef = contact_state(m, here, c, centre, distance, active, E, links[i].V, vec6())
                         for r in range(3):
                             last_jar[r] = pick(T(0.0), sticking, jar[r], last_jar[r])
