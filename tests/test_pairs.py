@@ -409,6 +409,8 @@ def test_other_fixed_shapes_are_touched_as_boxes_and_capsules(rng):
     [
         ('type="cylinder" size=".05 .3"', "capsule", "capsule"),
         ('type="cylinder" size=".5 .02"', "box", "capsule"),
+        ('type="cylinder" size=".3 .1"', "box", "capsule"),
+        ('type="mesh" mesh="wedge"', "box", "capsule"),
         ('type="cylinder" size=".06 .06"', "sphere", "sphere"),
         ('type="ellipsoid" size=".1 .2 .1"', "capsule", "capsule"),
         ('type="mesh" mesh="plate"', "box", "capsule"),
@@ -416,10 +418,11 @@ def test_other_fixed_shapes_are_touched_as_boxes_and_capsules(rng):
     ],
 )
 def test_what_stands_for_a_shape(shape, fixed, elsewhere):
-    """A box where it is nearer, of obstacles only."""
-    plate = '<asset><mesh name="plate" vertex="0 0 0 1 0 0 0 1 0 1 1 0 0 0 .1 1 0 .1 0 1 .1 1 1 .1"/></asset>'
+    """A box where it is nearer or the shape is flat, of obstacles only."""
+    plate = '<mesh name="plate" vertex="0 0 0 1 0 0 0 1 0 1 1 0 0 0 .1 1 0 .1 0 1 .1 1 1 .1"/>'
+    wedge = '<mesh name="wedge" vertex="0 0 0 1 0 0 0 .4 0 0 0 .1 1 0 .1 0 .4 .1"/>'
     arm = f'<body pos="3 0 0"> <geom {shape}/> <body> <joint/> <geom {shape} mass="1"/> </body> </body>'
-    m = as_primitives(parse(robot(f"{arm} <geom {shape}/>", plate, "")).mj_model)
+    m = as_primitives(parse(robot(f"{arm} <geom {shape}/>", f"<asset>{plate}{wedge}</asset>", "")).mj_model)
     kinds = [mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in m.geom_type]
     assert kinds == [fixed, elsewhere, elsewhere]
 

@@ -33,6 +33,7 @@ KINDS = {
 FEATURES = {PARALLEL: "parallel_geoms", CAPSULE_BOX: "capsule_box_geoms", BOXES: "box_geoms"}
 STRAIGHT = 1e-4  # sine between two capsules that are parallel
 DIRECTIONS = 2000  # in which shapes are measured
+ROUND = 0.8  # thickness over width from which on a capsule may stand for a shape
 MOST_PAIRS = 64  # contacts at once, in the environments that a thread steps together
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
 
@@ -244,15 +245,16 @@ def as_primitives(m: mujoco.MjModel) -> mujoco.MjModel:
     """Return a copy whose geoms have the shapes that touch each other here: a capsule or a box in place of SHAPES.
 
     A capsule has the length of its geom's bounding box, and its mean width. The bounding box itself stands for an
-    obstacle if its surface is clearly nearer to the shape's: pairs with a box cost more.
+    obstacle that is not about as thick as wide, such as a plate or a disc, on which a robot may step, or if its surface
+    is clearly nearer to the shape's: pairs with a box cost more.
     """
     fitted, fixed = copy.copy(m), obstacle_geoms(m)
     for geom in np.flatnonzero(np.isin(m.geom_type, SHAPES)).tolist():
         _fit(m, fitted, geom, boxed=False)
         if fixed[geom]:
-            difference = deviation(m, fitted, geom)
+            difference, (thick, wide, _) = deviation(m, fitted, geom), np.sort(m.geom_aabb[geom, 3:])
             _fit(m, fitted, geom, boxed=True)
-            if deviation(m, fitted, geom) > 0.95 * difference:
+            if thick > ROUND * wide and deviation(m, fitted, geom) > 0.95 * difference:
                 _fit(m, fitted, geom, boxed=False)
     return fitted
 
