@@ -27,7 +27,7 @@ from diffsim.extra.gait import trace
 from diffsim.extra.report import ROUGH_SHAPES, approximations
 from diffsim.robot.contact import ground_pairs
 from diffsim.robot.elements import control_range
-from diffsim.robot.pairs import as_primitives
+from diffsim.robot.pairs import as_primitives, touching
 from diffsim.robot.scene import Array, Scene
 from diffsim.sim.integration import Integration
 from diffsim.training import fail
@@ -174,11 +174,6 @@ def step_errors(scene: Scene) -> dict[str, object]:
             for name, theirs in zip(names, (first, second), strict=False):
                 row[name] = float(summary(differences(change, theirs)))
     return row
-
-
-def touching(data: mujoco.MjData) -> set[tuple[int, int]]:
-    """Name the pairs of geoms that touch, the lower one first."""
-    return {(min(pair), max(pair)) for pair in data.contact.geom.tolist()}
 
 
 def outcome(row: dict[str, object]) -> str:

@@ -15,6 +15,7 @@ from diffsim.robot.contact import (
     base_geoms,
     contact_points,
     ground_pairs,
+    matrix_of,
     pair_law,
 )
 from diffsim.robot.elements import control_range, label, listed, motors, muscles
@@ -122,9 +123,7 @@ def _ground(scene: Scene) -> Iterator[str]:
 
 def _depth(m: mujoco.MjModel, geom: int) -> float:
     """Return how far [m] a shape reaches beyond its contact points, in the direction where that is farthest."""
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, m.geom_quat[geom])
-    points = m.geom_pos[geom] + contact_points(m, geom)[0] @ rotation.reshape(3, 3).T
+    points = m.geom_pos[geom] + contact_points(m, geom)[0] @ matrix_of(m.geom_quat[geom]).T
     return float((reach(m, geom) - (directions() @ points.T).max(1)).max())
 
 

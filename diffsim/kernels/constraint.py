@@ -46,9 +46,9 @@ def contact_room(spec: KernelSpec) -> int:
     return max(1, min(spec.spheres, max(MOST_CONTACTS, spec.spheres // SHARES[spec.env_last])))
 
 
-def contact_columns(spec: KernelSpec) -> int:
-    """Return how many columns of the checkpoint contacts take: each lane's with the ground, then those of pairs."""
-    return 4 * contact_room(spec) * spec.threads_per_env + 3 * spec.pairs
+def pair_column(spec: KernelSpec) -> int:
+    """Return the checkpoint's first column of pairs.py, after accelerations and the lanes' contacts with the ground."""
+    return 2 * spec.nv + 4 * contact_room(spec) * spec.threads_per_env
 
 
 @cache
@@ -245,9 +245,9 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return total
 
     @wp.func
-    def accept_contacts(here: Lane, contacts: t.Contacts):
-        """Accept the last trial step of a lane's contacts."""
-        for s in range(wp.min(here.contacts, ROOM)):
+    def accept_contacts(begin: int, end: int, contacts: t.Contacts):
+        """Accept the last trial step of contacts, with the ground or of pairs.py."""
+        for s in range(begin, end):
             contacts[s].jar = contacts[s].trial_jar
             contacts[s].f = contacts[s].trial_force
 

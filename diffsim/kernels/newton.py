@@ -265,9 +265,9 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             motions[i].con_force = motions[i].trial_force
             motions[i].con_slope = motions[i].trial_slope
         if wp.static(CONTACT):
-            constraint.accept_contacts(here, contacts)
+            constraint.accept_contacts(0, wp.min(here.contacts, ROOM), contacts)
         if wp.static(PAIRS):
-            pairs.accept(here, contacts)
+            constraint.accept_contacts(here.begin, here.end, contacts)
         status.passes = status.passes + 1
         return root, status
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.constraint import contact_room
+from diffsim.kernels.constraint import pair_column
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lane import K_D, K_N, MU
 from diffsim.kernels.model import functions, types
@@ -38,7 +38,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     )
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
     SOLVES, VARIED, LEARNED = spec.solves, spec.varied, spec.parameters > 0
-    COLUMN = 2 * spec.nv + 4 * contact_room(spec)  # of jar in the checkpoint
+    COLUMN = pair_column(spec)  # of jar in the checkpoint
     COLUMNS = spec.parameters - 2 * spec.pairs  # see parameters.py
     JOINTS, POINTS, TURNS, TOUCH = spec.has("joint_rows point_rows turn_rows geoms_rows")
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]

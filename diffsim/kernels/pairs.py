@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.constraint import constraint_law, contact_room
+from diffsim.kernels.constraint import constraint_law, pair_column
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.pair_geometry import pair_geometry
@@ -41,7 +41,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     FLOATING, VARIED, WORLD = spec.floating, spec.varied, spec.room - 1
     listed, LAST = pair_list(spec), spec.pair_sizes.last
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
-    COLUMN = 2 * spec.nv + 4 * contact_room(spec)  # of jar in the checkpoint
+    COLUMN = pair_column(spec)  # of jar in the checkpoint
     JOINTS, TOUCH = spec.has("joint_rows geoms_rows")
 
     @wp.func
@@ -197,13 +197,6 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
             contacts[c].trial_force = f
             contacts[c].H = H
         return total
-
-    @wp.func
-    def accept(here: Lane, contacts: Contacts):
-        """Accept the last trial step."""
-        for c in range(here.begin, here.end):
-            contacts[c].jar = contacts[c].trial_jar
-            contacts[c].f = contacts[c].trial_force
 
     @wp.func
     def record(here: Lane, ck: Ck, contacts: Contacts):

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from diffsim.robot.contact import matrix_of
 from diffsim.robot.elements import motors, muscles, servos
 from diffsim.robot.scene import Array, Index, takes_euler
 
@@ -129,10 +130,9 @@ def transmissions_of(m: mujoco.MjModel, nlink: int, bodies: list[Body]) -> Trans
         begin.append(len(links))
     sites, pushed, torques, forces = list[int](), list[int](), list[Array](), list[Array]()
     for a in np.flatnonzero(at_site(m)).tolist():
-        site, turn = m.actuator_trnid[a, 0], np.zeros(9)
+        site = m.actuator_trnid[a, 0]
         link, rotation, position = bodies[m.site_bodyid[site]]
-        mujoco.mju_quat2Mat(turn, m.site_quat[site])
-        force, torque = m.actuator_gear[a].reshape(2, 3) @ (rotation @ turn.reshape(3, 3)).T
+        force, torque = m.actuator_gear[a].reshape(2, 3) @ (rotation @ matrix_of(m.site_quat[site])).T
         if link != bodies[0][0]:  # the world does not move
             sites.append(a)
             pushed.append(link)

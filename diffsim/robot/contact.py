@@ -117,6 +117,12 @@ def contact_points(m: mujoco.MjModel, geom: int) -> tuple[Array, float]:
     return points * (size[[0, 0, 1]] if kind == mujoco.mjtGeom.mjGEOM_CYLINDER else size), 0.0
 
 
+def matrix_of(quaternion: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a quaternion wxyz."""
+    mujoco.mju_quat2Mat(result := np.zeros(9), np.asarray(quaternion, float))
+    return result.reshape(3, 3)
+
+
 def hull(m: mujoco.MjModel, mesh: int) -> Array:
     """Return the vertices (n, 3) of a mesh's convex hull, or all of its vertices if MuJoCo has made no hull."""
     vertices: Array = m.mesh_vert[m.mesh_vertadr[mesh] :][: m.mesh_vertnum[mesh]].astype(float)

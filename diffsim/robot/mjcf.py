@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.actuator import force_bounds, gear_of, on_joint, servo_sums, transmissions_of
-from diffsim.robot.contact import contact_points, ground_pairs
+from diffsim.robot.contact import contact_points, ground_pairs, matrix_of
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, muscles, numeric, servos
 from diffsim.robot.pairs import with_obstacles, with_pairs
 from diffsim.robot.refuse import beyond, obstacles, strays
@@ -142,7 +142,7 @@ class _Reader:
     def _read_body(self, body: int) -> None:
         m = self.m
         link, parent_rotation, parent_position = self.body[m.body_parentid[body]]
-        rotation = parent_rotation @ _matrix(m.body_quat[body])
+        rotation = parent_rotation @ matrix_of(m.body_quat[body])
         position = parent_position + parent_rotation @ m.body_pos[body]
         joints = range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])
         free = bool(joints) and m.jnt_type[joints[0]] == Joint.mjJNT_FREE
@@ -215,7 +215,7 @@ class _Reader:
         for body, (link, rotation, position) in enumerate(self.body):
             if body == 0 or link < 0:
                 continue
-            principal = rotation @ _matrix(m.body_iquat[body])
+            principal = rotation @ matrix_of(m.body_iquat[body])
             com = position + rotation @ m.body_ipos[body]
             mass[link] += m.body_mass[body]
             moment[link] += m.body_mass[body] * com
@@ -288,7 +288,7 @@ class _Reader:
         m, centres, directions, radii = self.m, [np.zeros((0, 3))], [np.zeros((0, 3))], []
         for geom in geoms:
             _, rotation, position = self.body[m.geom_bodyid[geom]]
-            axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
+            axes, centre = rotation @ matrix_of(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
             points, radius = contact_points(m, geom)
             centres.append(np.array([centre + axes @ point for point in points]))
             along = {Geom.mjGEOM_CAPSULE: np.tile(axes[:, 2], (2, 1)), Geom.mjGEOM_BOX: points @ axes.T}
@@ -318,12 +318,6 @@ class _Reader:
     def _numeric(self, name: str, default: float) -> float:
         values = numeric(self.m, name)
         return float(values[0]) if len(values) else default
-
-
-def _matrix(quaternion: Array) -> Array:
-    result = np.zeros(9)
-    mujoco.mju_quat2Mat(result, np.asarray(quaternion, float))
-    return result.reshape(3, 3)
 
 
 def _skew(v: Array) -> Array:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.contact import UNBOUNDED, base_geoms, collide, declared_pairs, hull, pair_law
+from diffsim.robot.contact import UNBOUNDED, base_geoms, collide, declared_pairs, hull, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
 from diffsim.robot.scene import Array, Index, Scene, SceneError
 
@@ -203,9 +203,7 @@ class _Rows:
         turns = [data.xmat[body].reshape(3, 3) for body in objects]
         places = [data.xpos[b] + turn @ anchor for b, turn, anchor in zip(objects, turns, anchors, strict=True)]
         if welded:
-            relative = np.zeros(9)
-            mujoco.mju_quat2Mat(relative, numbers[6:10])
-            turns[0] = turns[0] @ relative.reshape(3, 3)
+            turns[0] = turns[0] @ matrix_of(numbers[6:10])
         return objects, places, turns
 
 
@@ -288,9 +286,8 @@ def directions() -> Array:
 
 def reach(m: mujoco.MjModel, geom: int) -> Array:
     """Return how far [m] a shape reaches in each direction (DIRECTIONS,) from the origin of its body's frame."""
-    (a, b, c), kind, rotation = m.geom_size[geom], m.geom_type[geom], np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, m.geom_quat[geom])
-    along = directions() @ rotation.reshape(3, 3)
+    (a, b, c), kind = m.geom_size[geom], m.geom_type[geom]
+    along = directions() @ matrix_of(m.geom_quat[geom])
     x, y, z = abs(along.T)
     reaches = {
         int(_Geom.mjGEOM_SPHERE): a + 0 * z,
@@ -341,6 +338,11 @@ def touching_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
     if m.nkey:
         mujoco.mj_resetDataKeyframe(m, data, 0)
     mujoco.mj_fwdPosition(m, data)
+    return touching(data)
+
+
+def touching(data: mujoco.MjData) -> set[tuple[int, int]]:
+    """Return the pairs of geoms of MuJoCo's contacts, the lower one first."""
     return {(min(a, b), max(a, b)) for a, b in data.contact.geom.tolist()}
 
 

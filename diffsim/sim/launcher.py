@@ -13,7 +13,7 @@ import warp as wp
 
 from diffsim import startup
 from diffsim.kernels.backward import backward_kernel
-from diffsim.kernels.constraint import contact_columns
+from diffsim.kernels.constraint import pair_column
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import Division, divide
 from diffsim.kernels.model import model_of, types
@@ -129,7 +129,7 @@ class Launcher:
         solves if damping follows the constraints.
         """
         spec, n, result = self.spec, self.num_envs, types(self.spec).Checkpoint()
-        accelerations = 2 * spec.nv + contact_columns(spec) if spec.constrained else spec.nv
+        accelerations = pair_column(spec) + 3 * spec.pairs if spec.constrained else spec.nv
         widths = (spec.nq, spec.nv, accelerations, spec.nfactor)
         counts = (count, count, count, spec.solves * count)
         numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
