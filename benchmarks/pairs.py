@@ -4,7 +4,7 @@
     python benchmarks/pairs.py path/to/mujoco_menagerie --parts time --device cuda --num-envs 4096
 
 Solver: MuJoCo moves a scene. From states on the way with rows between bodies, a substep in float64 ends after 1, 2, ...
-passes of Newton's method. At each iterate conjugate gradients run once more, by the rule of kernels/pair_solver.py on
+passes of Newton's method. At each iterate conjugate gradients run once more, by the rule of kernels/pairs/solver.py on
 dense matrices of MuJoCo's rows. States in which a step of theirs is not the kernel's are `left out`. All shapes are
 those of `as_primitives`, and MuJoCo has no islands. Gradients are those of mjData.solver. MuJoCo starts from its last
 acceleration and goes on to its own tolerance; `cold` counts its passes from qacc_smooth until its gradient is ours.
@@ -33,9 +33,9 @@ from speed import race, timer
 from tables import Row
 
 from diffsim import Integration, Scene, Simulator, load_scene
-from diffsim.kernels.pair_adjoint import ACCURACY_ADJOINT
-from diffsim.kernels.pair_solver import ROUND_OFF
-from diffsim.kernels.pairs import ACCURACY
+from diffsim.kernels.pairs.adjoint import ACCURACY_ADJOINT
+from diffsim.kernels.pairs.rows import ACCURACY
+from diffsim.kernels.pairs.solver import ROUND_OFF
 from diffsim.robot.elements import control_range
 from diffsim.robot.pairs import as_primitives, with_pairs
 from diffsim.robot.scene import Array
@@ -152,7 +152,7 @@ def linearize(m: mujoco.MjModel, data: mujoco.MjData, qacc: Array, first: bool =
 
 
 def conjugate_gradients(system: System, accuracy: float) -> tuple[Array, int]:
-    """Solve like kernels/pair_solver.py, whose names it has; returns Newton's step, and the number of steps to it."""
+    """Solve like kernels/pairs/solver.py, whose names it has; returns Newton's step, and the number of steps to it."""
     T, U, C, rest, weight = system
     inverse = np.linalg.inv(T)
     A, start = U @ inverse @ U.T, inverse @ rest

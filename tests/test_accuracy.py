@@ -16,8 +16,8 @@ import diffsim
 from diffsim.extra.terrain import incline
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.lanes import divide
-from diffsim.kernels.spec import kernel_spec
+from diffsim.kernels.thread.division import divide
+from diffsim.kernels.thread.spec import kernel_spec
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS

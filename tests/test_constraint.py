@@ -35,7 +35,7 @@ from test_terrain import HILLS, everywhere, hopping, pressed
 import diffsim
 from diffsim.extra.gait import trace
 from diffsim.extra.terrain import incline
-from diffsim.kernels import constraint
+from diffsim.kernels.mujoco import constraint
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim import simulator

@@ -23,8 +23,8 @@ from test_dynamics import mujoco_acceleration, relative_error
 from test_gradient import check_gradients
 
 import diffsim
-from diffsim.kernels.lanes import divide
-from diffsim.kernels.model import model_of
+from diffsim.kernels.thread.division import divide
+from diffsim.kernels.thread.model import model_of
 from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator

@@ -19,9 +19,9 @@ import diffsim
 from diffsim.extra.terrain import rough
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.lanes import divide
-from diffsim.kernels.spec import kernel_spec
-from diffsim.kernels.wide import module_options
+from diffsim.kernels.thread.division import divide
+from diffsim.kernels.thread.spec import kernel_spec
+from diffsim.kernels.thread.wide import module_options
 from diffsim.robot.constraint import constrained
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS

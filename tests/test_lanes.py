@@ -10,9 +10,9 @@ import warp as wp
 from scenes import leg_scene, parse, task_scene
 
 import diffsim
-from diffsim.kernels.lanes import divide
-from diffsim.kernels.model import model_of
-from diffsim.kernels.spec import KernelSpec, kernel_spec
+from diffsim.kernels.thread.division import divide
+from diffsim.kernels.thread.model import model_of
+from diffsim.kernels.thread.spec import KernelSpec, kernel_spec
 
 TEAMS = [(1, 1), (2, 1), (4, 1), (2, 2), (8, 4)]  # threads of an environment, and how many of them share limbs
 

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim.kernels import parameters as columns
-from diffsim.kernels.lanes import divide
-from diffsim.kernels.model import model_of
+from diffsim.kernels.thread.division import divide
+from diffsim.kernels.thread.model import model_of
 from diffsim.robot.constraint import LEAST_FRICTION, LEAST_WEIGHT, constrained
 from diffsim.robot.contact import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos

@@ -11,22 +11,22 @@ from functools import cache
 
 import warp as wp
 
-from diffsim.kernels.constraint import constraint_law, contact_room
-from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.force import external_force
-from diffsim.kernels.joint import joint_law
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.lane import lane_of
-from diffsim.kernels.link import link_law
-from diffsim.kernels.model import types
-from diffsim.kernels.muscle import muscle_law
+from diffsim.kernels.laws.force import external_force
+from diffsim.kernels.laws.joint import joint_law
+from diffsim.kernels.laws.muscle import muscle_law
+from diffsim.kernels.mujoco.constraint import constraint_law, contact_room
 from diffsim.kernels.newton import newton_method
-from diffsim.kernels.pairs import pair_rows
-from diffsim.kernels.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import FAR, MAX_POSITION, MAX_SPEED, KernelSpec
+from diffsim.kernels.pairs.rows import pair_rows
+from diffsim.kernels.thread.exchange import lane_sums
+from diffsim.kernels.thread.lane import lane_of
+from diffsim.kernels.thread.model import types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import FAR, MAX_POSITION, MAX_SPEED, KernelSpec
+from diffsim.kernels.thread.wide import blocks, module_options
 from diffsim.kernels.transmission import transmission_law
-from diffsim.kernels.wide import blocks, module_options
+from diffsim.kernels.tree.kinematics import kinematics
+from diffsim.kernels.tree.link import link_law
+from diffsim.kernels.tree.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
 
 
 @cache

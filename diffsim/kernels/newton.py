@@ -16,14 +16,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.constraint import UNSOLVED, constraint_law, contact_room
-from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.joint import joint_law
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.pairs import pair_rows
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.laws.joint import joint_law
+from diffsim.kernels.mujoco.constraint import UNSOLVED, constraint_law, contact_room
+from diffsim.kernels.pairs.rows import pair_rows
+from diffsim.kernels.thread.exchange import lane_sums
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 
 MAX_EVALUATIONS = 12  # evaluations of a line search
 BRACKET_MARGIN = 0.1  # least distance of a secant step from the ends of the bracket, in multiples of its width

@@ -14,13 +14,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.constraint import constraint_law
-from diffsim.kernels.joint import joint_law
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.laws.joint import joint_law
+from diffsim.kernels.mujoco.constraint import constraint_law
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
+from diffsim.kernels.tree.kinematics import kinematics
 
 # Columns: of each link mass, first moments (3) and moments of inertia xx, yy, zz, xy, xz, yz; of each joint, in its
 # link's row, those named below; of each motor gear and bias; of each contact with the ground, and then of each block of

@@ -20,13 +20,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.clamp import clamp_law
-from diffsim.kernels.joint import joint_law
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.muscle import muscle_law
-from diffsim.kernels.pair_solver import row_solver
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.laws.clamp import clamp_law
+from diffsim.kernels.laws.joint import joint_law
+from diffsim.kernels.laws.muscle import muscle_law
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
+from diffsim.kernels.tree.branches import branch_solver
 
 
 @cache
@@ -36,7 +36,7 @@ def transmission_law(spec: KernelSpec) -> SimpleNamespace:
     wrench_to_world, clamped = muscle_law(spec).wrench_to_world, clamp_law(spec).clamped
     VARIED, NU, FLOATING = spec.varied, spec.nu, spec.floating
     TENDON, DAMPED, CHAIN = spec.has("tendon tendon_damping tendon_chain")
-    forward, backward = (row_solver(spec, rows) if CHAIN else None for rows in ("Motions", "Nodes"))
+    forward, backward = (branch_solver(spec, rows) if CHAIN else None for rows in ("Motions", "Nodes"))
     SOLVES = spec.solves
 
     @wp.func

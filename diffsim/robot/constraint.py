@@ -1,6 +1,7 @@
 """MuJoCo's constraints of a robot, from its file's solref, solimp, friction, margin and frictionloss.
 
-Nothing here is fitted. MuJoCo's documentation, "Computation", defines the law; kernels/constraint.py has the equations.
+Nothing here is fitted. MuJoCo's documentation, "Computation", defines the law;
+kernels/mujoco/constraint.py has the equations.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Coefficients of a fluid's drag on links, see kernels/drag.py."""
+"""Coefficients of a fluid's drag on links, see kernels/laws/drag.py."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from diffsim.robot.scene import Array, Scene
 
 
 def drag(scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """Compute the fluid's drag on each link by MuJoCo's inertia-box law; see kernels/drag.py for its form.
+    """Compute the fluid's drag on each link by MuJoCo's inertia-box law; see kernels/laws/drag.py for its form.
 
     Returns:
         principal axes (nlink, 3, 3) in the link's frame; the viscous coefficients (nlink, 3) of force and torque,

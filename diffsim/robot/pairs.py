@@ -1,4 +1,4 @@
-"""Rows of MuJoCo's constraints between two bodies: equality and contact of a file, for kernels/pairs.py."""
+"""Rows of MuJoCo's constraints between two bodies: equality and contact of a file, for kernels/pairs/rows.py."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from diffsim.robot.scene import Array, Index, Scene, SceneError
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
 Touch = Callable[[int, int], Array]  # two geoms
-JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs.py
+JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs/rows.py
 NAMES = "joint", "point", "turn", "geoms"
 _Geom = mujoco.mjtGeom
 SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "MESH")]  # made others

@@ -13,11 +13,11 @@ import warp as wp
 
 from diffsim import startup
 from diffsim.kernels.backward import backward_kernel
-from diffsim.kernels.constraint import pair_column
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.lanes import Division, divide
-from diffsim.kernels.model import model_of, types
-from diffsim.kernels.spec import kernel_spec
+from diffsim.kernels.mujoco.constraint import pair_column
+from diffsim.kernels.thread.division import Division, divide
+from diffsim.kernels.thread.model import model_of, types
+from diffsim.kernels.thread.spec import kernel_spec
 from diffsim.robot.scene import Scene
 from diffsim.sim.options import BLOCKS, WARP_DTYPE, Options
 

@@ -140,5 +140,5 @@ def test_fingerprints_notice_changed_numbers_and_no_changed_words(tmp_path):
     before = fingerprints.fingerprint(common.ROOT, "cartpole")
     assert before and changed("tasks/cartpole.py", "Eq. 13:", "Equation 13 says:") == before
     assert changed("tasks/cartpole.py", "0.1", "0.11") not in (before, "")
-    assert changed("kernels/spatial.py", "p = mass * ", "p = T(1.01) * mass * ") not in (before, "")
+    assert changed("kernels/thread/spatial.py", "p = mass * ", "p = T(1.01) * mass * ") not in (before, "")
     assert changed("tasks/cartpole.py", "import", "imports") == ""

@@ -12,11 +12,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.pair_geometry import TINY, pair_geometry
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.pairs.geometry import TINY, pair_geometry
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 
 # In float64, as MuJoCo's, and in float32
 PARALLEL_SQ = 1e-8, 1e-6  # square of the sine between two parallel capsules

@@ -20,10 +20,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 from diffsim.robot.pairs import JOINT, POINT, TURN
 
 LEAST = 1e-12  # of 4 w^2, at a rotation by half a turn

@@ -7,9 +7,9 @@ from functools import cache
 
 import warp as wp
 
-from diffsim.kernels.model import types
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.thread.model import types
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 from diffsim.robot.scene import FACTORS
 
 K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))

@@ -18,10 +18,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 
 SHORTEST = 1e-6  # m
 

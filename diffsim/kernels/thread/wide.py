@@ -17,8 +17,8 @@ from typing import Any
 
 import warp as wp
 
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spec import KernelSpec
 
 PREAMBLE = """
 namespace wp {

@@ -15,10 +15,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.clamp import clamp_law
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.laws.clamp import clamp_law
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 
 
 @cache

@@ -9,14 +9,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.box_contacts import box_contacts
-from diffsim.kernels.capsule_contacts import capsule_contacts
-from diffsim.kernels.constraint import UNSOLVED
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.pair_geometry import pair_geometry
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.mujoco.constraint import UNSOLVED
+from diffsim.kernels.pairs.boxes import box_contacts
+from diffsim.kernels.pairs.capsules import capsule_contacts
+from diffsim.kernels.pairs.geometry import pair_geometry
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 from diffsim.robot.pairs import BOXES, CAPSULE_BOX, PARALLEL
 
 

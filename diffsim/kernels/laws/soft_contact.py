@@ -18,12 +18,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.lane import K_D, K_N, K_T, MU
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.terrain import terrain_contact
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.laws.terrain import terrain_contact
+from diffsim.kernels.thread.lane import K_D, K_N, K_T, MU
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 
 
 @cache

@@ -14,10 +14,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.terrain import terrain_contact
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.laws.terrain import terrain_contact
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 
 LEAST_FRICTION = 1e-5  # MuJoCo's, of a contact with friction
 UPRIGHT = 1e-9  # horizontal part of a capsule's unit vector, below which its contacts have the ground's frame

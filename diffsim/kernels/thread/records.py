@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.thread.spec import KernelSpec
 
 # Fields of Model with rows between bodies (robot/pairs.py), as FIELDS of model.py
 PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {

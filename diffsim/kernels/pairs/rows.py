@@ -14,16 +14,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.constraint import constraint_law, pair_column
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.pair_geometry import pair_geometry
-from diffsim.kernels.pair_list import pair_list
-from diffsim.kernels.pair_solver import row_solver
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
+from diffsim.kernels.mujoco.constraint import constraint_law, pair_column
+from diffsim.kernels.pairs.geometry import pair_geometry
+from diffsim.kernels.pairs.listing import pair_list
+from diffsim.kernels.pairs.solver import row_solver
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
+from diffsim.kernels.tree.kinematics import kinematics
 from diffsim.robot.pairs import GEOMS, JOINT
 
 ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterate's, in the norm of T^-1

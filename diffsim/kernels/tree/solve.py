@@ -5,12 +5,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.joint import joint_law
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.laws.joint import joint_law
+from diffsim.kernels.thread.exchange import lane_sums
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.tree.kinematics import kinematics
 
 # Phases of a substep: Newton's passes, the factor of the last iterate, the damped solve
 NEWTON, FACTOR, SOLVE, DONE = range(4)

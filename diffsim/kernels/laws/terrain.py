@@ -21,9 +21,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 
 
 @cache

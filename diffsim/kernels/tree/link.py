@@ -5,12 +5,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.contact import contact_law
-from diffsim.kernels.drag import drag_law
-from diffsim.kernels.lane import MASS
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.laws.drag import drag_law
+from diffsim.kernels.laws.soft_contact import contact_law
+from diffsim.kernels.thread.lane import MASS
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
 
 
 @cache

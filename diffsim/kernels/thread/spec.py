@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from diffsim.kernels.lanes import Division
+from diffsim.kernels.thread.division import Division
 from diffsim.robot.pairs import PairSizes
 from diffsim.robot.scene import Scene
 
@@ -54,12 +54,12 @@ class KernelSpec:
 
     @property
     def branched(self) -> bool:
-        """Tell whether a matrix leaves the tree's shape (pair_solver.py)."""
+        """Tell whether a matrix leaves the tree's shape (tree/branches.py)."""
         return self.pairs > 0 or "tendon_chain" in self.features
 
     @property
     def room(self) -> int:
-        """Return the number of links in local arrays: the last one is the world, where pair_solver.py needs it."""
+        """Return the number of links in local arrays: the last one is the world, where tree/branches.py needs it."""
         return self.slots + int(self.branched)
 
     @property

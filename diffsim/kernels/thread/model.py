@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from diffsim.kernels.lanes import Division
-from diffsim.kernels.records import OPTIONAL_FIELDS, add_constraints, parts_of
-from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.thread.division import Division
+from diffsim.kernels.thread.records import OPTIONAL_FIELDS, add_constraints, parts_of
+from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.robot.drag import drag
 from diffsim.robot.scene import Scene
 

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spec import KernelSpec
 
 
 @cache

@@ -9,18 +9,19 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.constraint import pair_column
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.lane import K_D, K_N, MU
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.pair_geometry import pair_geometry
-from diffsim.kernels.pair_list import pair_list
-from diffsim.kernels.pair_solver import row_solver
-from diffsim.kernels.pairs import pair_rows
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
+from diffsim.kernels.mujoco.constraint import pair_column
+from diffsim.kernels.pairs.geometry import pair_geometry
+from diffsim.kernels.pairs.listing import pair_list
+from diffsim.kernels.pairs.rows import pair_rows
+from diffsim.kernels.pairs.solver import row_solver
+from diffsim.kernels.thread.lane import K_D, K_N, MU
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
+from diffsim.kernels.tree.branches import branch_solver
+from diffsim.kernels.tree.kinematics import kinematics
 from diffsim.robot.pairs import GEOMS, JOINT, POINT, TURN
 
 ACCURACY_ADJOINT = 1e-12, 1e-6  # as ACCURACY of pairs.py, in float64 and in float32
@@ -32,6 +33,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     """Make the rows' part of the adjoint."""
     t, block, kin, geometry = types(spec), blocks(spec), kinematics(spec), pair_geometry(spec)
     rows, listed, solver, sp = pair_rows(spec), pair_list(spec), row_solver(spec, "Nodes"), spatial(spec)
+    recall_factor = branch_solver(spec, "Nodes").recall_factor
     T, vec3, vec6, pick, join, force_at = t.T, t.vec3, t.vec6, block.pick, sp.join, sp.force_at
     Model, Lane, Ck, Links, Contacts, Nodes, Adjoints, Array = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Nodes Adjoints Ts".split()
@@ -68,7 +70,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     def correct_lambda(m: Model, here: Lane, links: Links, ck: Ck, contacts: Contacts, nodes: Nodes):
         """Turn the tree's lambda, and the twists under it, into those with the rows between bodies."""
         if here.end > here.begin:
-            L = solver.recall_factor(here, ck, SOLVES * here.row + SOLVES - 1, nodes)
+            L = recall_factor(here, ck, SOLVES * here.row + SOLVES - 1, nodes)
             for c in range(here.begin, here.end):
                 contacts[c].rate = lambda_rates(m, c, contacts, nodes)
             solver.solve(m, here, links, contacts, nodes, L, T(1.0), T(ENOUGH))

@@ -23,12 +23,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.pair_geometry import pair_geometry
-from diffsim.kernels.solve import base_inertia
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.pairs.geometry import pair_geometry
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
+from diffsim.kernels.tree.branches import branch_solver
 from diffsim.robot.pairs import JOINT
 
 # The search ends where p.z, the square of the residual in the norm of T^-1, is small in comparison with that of b, or
@@ -39,18 +38,10 @@ ROUND_OFF = 1e-6
 @cache
 def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     """Make the conjugate gradients on branches, the array of structs ("Motions" or "Nodes") that has T's factor."""
-    t, block, geometry, base = types(spec), blocks(spec), pair_geometry(spec), base_inertia(spec)
-    T, vec3, vec6, mat6, pick = t.T, t.vec3, t.vec6, t.mat6, block.pick
+    t, block, geometry, tree = types(spec), blocks(spec), pair_geometry(spec), branch_solver(spec, array)
+    T, vec3, mat6, pick, clear, solve_tree = t.T, t.vec3, t.mat6, block.pick, tree.clear, tree.solve_tree
     Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
-    FLOATING, ROOM, BASE, load = spec.floating, spec.room, 7 * (spec.nlink - 1), kinematics(spec).load
     STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
-
-    @wp.func
-    def clear(branches: Branches):
-        room = int(ROOM)
-        for i in range(room):
-            branches[i].twist = vec6()
-            branches[i].rate = T(0.0)
 
     @wp.func
     def spread(m: Model, c: int, contacts: Contacts, f: vec3, branches: Branches):
@@ -64,56 +55,6 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
         if m.row_kind[s] == JOINT:
             branches[i].rate = branches[i].rate - contacts[c].slope * f[0]
             branches[j].rate = branches[j].rate + f[0]
-
-    @wp.func
-    def solve_factored(L: mat6, b: vec6):
-        """Return I^-1 b by the base's Cholesky factor L."""
-        a = b
-        for r in range(6):
-            y = a[r]
-            for k in range(r):
-                y = y - L[r, k] * a[k]
-            a[r] = y * L[r, r]
-        return base.back_substitute(L, a)
-
-    @wp.func
-    def solve_tree(m: Model, here: Lane, links: Links, branches: Branches, L: mat6):
-        """Solve T x = forces: twist and rate have the forces on entry, see spread, and x on return."""
-        for k in range(1, here.n):
-            i = here.n - k
-            p = m.parent[i]
-            own = branches[i].twist
-            u = branches[i].rate - wp.dot(links[i].S, own)
-            branches[i].rate = u
-            if wp.static(FLOATING) or p > 0:
-                branches[p].twist = branches[p].twist + own + branches[i].U * (u * branches[i].dinv)
-        if wp.static(FLOATING):
-            branches[0].twist = solve_factored(L, -branches[0].twist)
-        else:
-            branches[0].twist = vec6()
-        for i in range(1, here.n):
-            A = branches[m.parent[i]].twist
-            accel = (branches[i].rate - wp.dot(branches[i].U, A)) * branches[i].dinv
-            branches[i].rate = accel
-            branches[i].twist = A + links[i].S * accel
-        branches[ROOM - 1].twist = vec6()
-        branches[ROOM - 1].rate = T(0.0)
-
-    @wp.func
-    def recall_factor(here: Lane, ck: t.Checkpoint, row: int, branches: Branches):
-        """Load T's factor of a checkpoint's row; returns the base's."""
-        for i in range(1, here.n):
-            for r in range(6):
-                branches[i].U[r] = load(ck.f, row, 7 * (i - 1) + r, here.e)
-            branches[i].dinv = load(ck.f, row, 7 * (i - 1) + 6, here.e)
-        L = mat6()
-        if wp.static(FLOATING):
-            k = int(BASE)
-            for r in range(6):
-                for c in range(r + 1):
-                    L[r, c] = load(ck.f, row, k, here.e)
-                    k = k + 1
-        return L
 
     @wp.func
     def rates_of(m: Model, c: int, contacts: Contacts, branches: Branches):

@@ -25,14 +25,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.lane import K_D, K_N, MU
-from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.terrain import terrain_contact
-from diffsim.kernels.wide import blocks
+from diffsim.kernels.laws.terrain import terrain_contact
+from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
+from diffsim.kernels.thread.lane import K_D, K_N, MU
+from diffsim.kernels.thread.model import functions, types
+from diffsim.kernels.thread.spatial import spatial
+from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
+from diffsim.kernels.tree.kinematics import kinematics
 
 # All points of a lane may touch the ground at once on a CPU, a share of them on a GPU, and MOST_CONTACTS in any case. A
 # GPU's compiler writes out how each element of a local array begins: for the 456 points of a G1's meshes in a minute.

@@ -1,0 +1,1 @@
+"""Forces on joints, links and contact spheres, a law per file with its adjoint."""

@@ -1,0 +1,1 @@
+"""Rows of MuJoCo's constraints between two bodies: equality and contact of geoms."""
