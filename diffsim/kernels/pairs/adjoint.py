@@ -62,8 +62,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def lambda_rates(m: Model, c: int, contacts: Contacts, nodes: Nodes):
-        i = m.row_link[2 * contacts[c].row]
-        j = m.row_link[2 * contacts[c].row + 1]
+        i, j = geometry.ends(m, contacts[c].row)
         return geometry.rates(m, c, contacts, nodes[i].W, nodes[j].W, nodes[i].lam, nodes[j].lam)
 
     @wp.func
@@ -91,8 +90,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     def add_violation_adjoint(m: Model, c: int, g: vec3, contacts: Contacts, nodes: Nodes, adj: Adjoints):
         """Add the adjoint g of an equality's violation to those of what it depends on."""
         s = contacts[c].row
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = geometry.ends(m, s)
         first, second = geometry.wrenches(m, c, contacts, g)
         adj[i].p = adj[i].p - first
         adj[j].p = adj[j].p + second
@@ -123,8 +121,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
 
         In the frame R of i, jar is h(accel) - |rate|^2 v scale / 2 + b h(rate), h(x) = scale (w x + x x v).
         """
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = geometry.ends(m, s)
         w, v, R = geometry.turn_of(m, s, links)
         scale = T(0.5) * T(m.row_shape[s][0])
         rate, accel = geometry.turn_motion(R, links[i].V, links[j].V, nodes[i].A, nodes[j].A)
@@ -153,8 +150,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     ):
         """Add the part of an equality's block, with that rate under lambda."""
         s = contacts[c].row
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = geometry.ends(m, s)
         kind = m.row_kind[s]
         b = T(m.row_params[s][1])
         f = contacts[c].f
@@ -215,8 +211,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
                     adj_factors[COLUMNS + 2 * s] = adj_factors[COLUMNS + 2 * s] - by_mu
                 if wp.static(VARIED):
                     g = contacts[c].H * rate
-                    i = m.row_link[2 * s]
-                    j = m.row_link[2 * s + 1]
+                    i, j = geometry.ends(m, s)
                     velocity = geometry.rates(m, c, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
                     by_k = T(0.5) * coef[1] * wp.dot(g, velocity) + g[2] * state[2]
                     adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
@@ -229,8 +224,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     ):
         """Add the part of two geoms' block, with that rate under lambda, as constraint.add_contacts_adjoint."""
         s = contacts[c].row
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = geometry.ends(m, s)
         b = rows.constants(m, here, s)[1]
         E = contacts[c].E
         f = contacts[c].f
@@ -240,8 +234,9 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
         g_turn = wp.cross(g, contacts[c].jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, rate)
         g_p = add_end_adjoint(i, contacts[c].p, b, -(E * g), -(E * f), links, nodes, adj)
         g_p = g_p + add_end_adjoint(j, contacts[c].p, b, E * g, E * f, links, nodes, adj)
-        first, second = listed.contact_adjoint(m, c, links, contacts, g_p, g_r, g_turn)
-        adj[i].p = adj[i].p + first
+        n, g_n = geometry.normal_of(c, contacts, g_turn)
+        second = listed.contact_adjoint(m, c, links, contacts, n, g_p, g_r, g_n)
+        adj[i].p = adj[i].p + force_at(contacts[c].p, g_p) + join(wp.cross(n, g_n), vec3()) - second
         adj[j].p = adj[j].p + second
 
     @wp.func

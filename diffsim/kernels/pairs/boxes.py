@@ -264,13 +264,12 @@ def box_contacts(spec: KernelSpec) -> SimpleNamespace:
         return CORNERS
 
     @wp.func
-    def boxes_adjoint(m: Model, c: int, contacts: Contacts, g_p: vec3, g_r: T, g_turn: vec3):
-        """Return the adjoints of both links' poses, see touch_adjoint of pair_geometry.py."""
+    def boxes_adjoint(m: Model, c: int, contacts: Contacts, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
+        """Return the wrench of a contact, see pair_list.contact_adjoint."""
         how = contacts[c].how
         z = contacts[c].vertex
         a = contacts[c].a
         b = contacts[c].b
-        n, g_n = geometry.normal_of(c, contacts, g_turn)
         # corners of a face
         half = T(0.5) * (contacts[c].r + T(m.row_params[contacts[c].row][10]))
         N = (T(2.0) * how[1] - T(1.0)) * n
@@ -280,19 +279,16 @@ def box_contacts(spec: KernelSpec) -> SimpleNamespace:
         g_N = (T(2.0) * how[1] - T(1.0)) * g_n - half * g_p
         inc = force_at(z, F)
         ref = force_at(z, g_p - F) + join(wp.cross(N, g_N), vec3())
-        first = geometry.blend_wrenches(how[1], ref, inc)
-        second = geometry.blend_wrenches(how[1], inc, ref)
+        wrench = geometry.blend_wrenches(how[1], inc, ref)
         if block.any_of(how[0]):
             d = T(2.0) * (contacts[c].p - z)
             g_n = g_n + g_r * (d - wp.dot(d, n) * n)
             g1, g2 = T(0.5) * g_p - g_r * n, T(0.5) * g_p + g_r * n
-            one, two = geometry.slide_adjoint(z, d, a, b, how[2], how[3], g1, g2)
+            two = geometry.slide_adjoint(z, d, a, b, how[2], how[3], g1, g2)
             across = wp.cross(a, b)
             g_across = (sign(wp.dot(across, n)) / wp.max(wp.length(across), T(TINY))) * (g_n - wp.dot(g_n, n) * n)
-            one = one + join(wp.cross(a, wp.cross(b, g_across)), vec3())
             two = two + join(wp.cross(b, wp.cross(g_across, a)), vec3())
-            first = geometry.blend_wrenches(how[0], one, first)
-            second = geometry.blend_wrenches(how[0], two, second)
-        return first, second
+            wrench = geometry.blend_wrenches(how[0], two, wrench)
+        return wrench
 
     return functions(locals())

@@ -58,14 +58,14 @@ def capsule_contacts(spec: KernelSpec) -> SimpleNamespace:
         contacts[end + 1].active = parallel * contacts[end + 1].active
 
     @wp.func
-    def parallel_adjoint(m: Model, c: int, links: Links, contacts: Contacts, g_p: vec3, g_r: T, g_turn: vec3):
-        """Return the adjoints of both links' poses, see touch_adjoint of pair_geometry.py."""
+    def parallel_adjoint(m: Model, c: int, links: Links, contacts: Contacts, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
+        """Return the wrench of a contact, see pair_list.contact_adjoint."""
         s = contacts[c].row
         touch = geometry.segments(m, s, links)
         touch.s1 = contacts[c].how[0]
         touch.s2 = contacts[c].how[1]
         touch.d = (touch.x2 + touch.s2 * touch.a2) - (touch.x1 + touch.s1 * touch.a1)
-        return geometry.touch_adjoint(m, s, links, touch, g_p, g_r, g_turn)
+        return geometry.touch_adjoint(m, s, links, touch, n, g_p, g_r, g_n)
 
     @wp.func
     def nearest_to_box(y: vec3, h: vec3, b: vec3):
@@ -214,23 +214,19 @@ def capsule_contacts(spec: KernelSpec) -> SimpleNamespace:
         return 2
 
     @wp.func
-    def capsule_box_adjoint(m: Model, c: int, links: Links, contacts: Contacts, g_p: vec3, g_r: T, g_turn: vec3):
-        """Return the adjoints of both links' poses, see touch_adjoint of pair_geometry.py."""
+    def capsule_box_adjoint(m: Model, c: int, links: Links, contacts: Contacts, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
+        """Return the wrench of a contact, see pair_list.contact_adjoint."""
         s = contacts[c].row
         z = contacts[c].vertex
         capsule = geometry.segments(m, s, links)
-        touch = geometry.to_box(m, s, links, z, capsule.x2)
-        first, second = geometry.touch_adjoint(m, s, links, touch, g_p, g_r, g_turn)
+        wrench = geometry.touch_adjoint(m, s, links, geometry.to_box(m, s, links, z, capsule.x2), n, g_p, g_r, g_n)
         # on the surface
-        n, g_n = geometry.normal_of(c, contacts, g_turn)
         g_z = g_r + T(0.5) * wp.dot(n, g_p)
         turn = wp.cross(n, g_n + T(0.5) * T(m.row_shape[s][1]) * g_p)
-        on_surface = contacts[c].how[0]
-        first = geometry.blend_wrenches(on_surface, force_at(z, g_p - g_z * n), first)
-        second = geometry.blend_wrenches(on_surface, force_at(z, g_z * n) + join(turn, vec3()), second)
+        wrench = geometry.blend_wrenches(contacts[c].how[0], force_at(z, g_z * n) + join(turn, vec3()), wrench)
         # as s moves
-        g_s = wp.dot(wp.spatial_bottom(first), capsule.a1)
-        moved = force_at(capsule.x1, g_s * contacts[c].a) + join(g_s * wp.cross(capsule.a1, contacts[c].b), vec3())
-        return first + moved, second - moved
+        g_s = wp.dot(g_p - wp.spatial_bottom(wrench), capsule.a1)
+        wrench = wrench - force_at(capsule.x1, g_s * contacts[c].a)
+        return wrench - join(g_s * wp.cross(capsule.a1, contacts[c].b), vec3())
 
     return functions(locals())

@@ -44,10 +44,14 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     LEAST_DET = PARALLEL[int(t.U == wp.float32)]
 
     @wp.func
+    def ends(m: Model, s: int):
+        """Return the slots of a row's two links."""
+        return m.row_link[2 * s], m.row_link[2 * s + 1]
+
+    @wp.func
     def turn_of(m: Model, s: int, links: Links):
         """Return w and the vector part of the quaternion of j relative to i, and the frame of i."""
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = ends(m, s)
         R = links[i].R * mat3(m.row_first_frame[s])
         Q = wp.transpose(R) * (links[j].R * mat3(m.row_second_frame[s]))
         w = T(0.5) * wp.sqrt(wp.max(T(1.0) + wp.trace(Q), T(LEAST)))
@@ -77,8 +81,7 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def violation(m: Model, s: int, links: Links):
         """Return the violation of an equality's block."""
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = ends(m, s)
         r = vec3()
         if wp.static(JOINTS):
             if m.row_kind[s] == JOINT:
@@ -98,8 +101,7 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     def place(m: Model, c: int, links: Links, contacts: Contacts):
         """Set the points and the frame of an equality's block."""
         s = contacts[c].row
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = ends(m, s)
         contacts[c].E = wp.identity(3, dtype=T)
         if wp.static(JOINTS):
             if m.row_kind[s] == JOINT:
@@ -137,8 +139,7 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     def drift(m: Model, c: int, links: Links, contacts: Contacts, first: vec6, second: vec6):
         """Return dJ/dt v of an equality's rows, from the links' accelerations A without those of joints."""
         s = contacts[c].row
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = ends(m, s)
         a = vec3()
         if wp.static(POINTS):
             if m.row_kind[s] == POINT:
@@ -213,8 +214,7 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
     def segments(m: Model, s: int, links: Links):
         """Return two geoms with their centres and half axes."""
         c = m.row_shape[s]
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = ends(m, s)
         touch = Touch()
         touch.x1 = sp.on_link(links[i].R, links[i].x, m.row_first[s])
         touch.x2 = sp.on_link(links[j].R, links[j].x, m.row_second[s])
@@ -285,22 +285,6 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return s1, s2, (x2 + s2 * a2) - (x1 + s1 * a1)
 
     @wp.func
-    def nearest_points(m: Model, s: int, links: Links):
-        """Return two geoms with their nearest points."""
-        touch = segments(m, s, links)
-        s1, s2, d = nearest(touch.x1, touch.a1, touch.x2, touch.a2)
-        side = T(1.0)
-        if has_box(m, s):
-            point, free, R, found = box_point(m, s, links, touch.x1 - touch.x2)
-            d = point - (touch.x1 - touch.x2)
-            side = found
-        touch.s1 = s1
-        touch.s2 = s2
-        touch.d = d
-        touch.side = side
-        return touch
-
-    @wp.func
     def to_box(m: Model, s: int, links: Links, centre: vec3, x2: vec3):
         """Return a sphere and a box with their nearest points."""
         point, free, R, side = box_point(m, s, links, centre - x2)
@@ -309,6 +293,18 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         touch.x2 = x2
         touch.d = point - (centre - x2)
         touch.side = side
+        return touch
+
+    @wp.func
+    def nearest_points(m: Model, s: int, links: Links):
+        """Return two geoms with their nearest points."""
+        touch = segments(m, s, links)
+        if has_box(m, s):
+            return to_box(m, s, links, touch.x1, touch.x2)
+        s1, s2, d = nearest(touch.x1, touch.a1, touch.x2, touch.a2)
+        touch.s1 = s1
+        touch.s2 = s2
+        touch.d = d
         return touch
 
     @wp.func
@@ -329,11 +325,6 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         return E, length, along, size
 
     @wp.func
-    def normal_adjoint(E: mat3, along: T, size: T, g_turn: vec3):
-        """Return the adjoint of a contact's normal by that of a rotation of its frame, in the frame."""
-        return E * vec3(g_turn[1], -g_turn[0] - along / size * g_turn[2], T(0.0))
-
-    @wp.func
     def set_normal(c: int, n: vec3, which: T, contacts: Contacts):
         """Give a contact the frame with the normal n, where `which` is 1."""
         E, length, along, size = contact_frame(n)
@@ -347,7 +338,7 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         frame = contacts[c].E
         n = vec3(frame[0, 2], frame[1, 2], frame[2, 2])
         E, length, along, size = contact_frame(n)
-        return n, normal_adjoint(E, along, size, g_turn)
+        return n, E * vec3(g_turn[1], -g_turn[0] - along / size * g_turn[2], T(0.0))
 
     @wp.func
     def place_touch(m: Model, s: int, c: int, touch: Touch, contacts: Contacts):
@@ -364,7 +355,7 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def slide_adjoint(z1: vec3, d: vec3, a1: vec3, a2: vec3, free1: T, free2: T, g1: vec3, g2: vec3):
-        """Return the adjoints of both links' poses, as wrenches, of those of two nearest points, z_1 and z_1 + d.
+        """Return the wrench (pair_list.contact_adjoint) of the adjoints of two nearest points, z_1 and z_1 + d.
 
         A point is free, 1, to move along its segment with half axis a, or not, 0.
         """
@@ -376,31 +367,23 @@ def pair_geometry(spec: KernelSpec) -> SimpleNamespace:
         inv_det = T(1.0) / wp.max(ma * mc - mb * mb, T(LEAST_DET) * ma * mc)
         m1 = free1 * (mc * q1 + mb * q2) * inv_det
         m2 = -free2 * (mb * q1 + ma * q2) * inv_det
-        first = force_at(z1, g1 - m1 * a1 - m2 * a2) + sp.join(m1 * wp.cross(a1, d), vec3())
-        second = force_at(z1 + d, g2 + m1 * a1 + m2 * a2) + sp.join(m2 * wp.cross(a2, d), vec3())
-        return first, second
+        return force_at(z1 + d, g2 + m1 * a1 + m2 * a2) + sp.join(m2 * wp.cross(a2, d), vec3())
 
     @wp.func
-    def touch_adjoint(m: Model, s: int, links: Links, touch: Touch, g_p: vec3, g_r: T, g_turn: vec3):
-        """Return the adjoints of both links' poses, as wrenches, where two geoms touch.
-
-        Those of the point are g_p, of the distance g_r, of a rotation of the frame, in the frame, g_turn.
-        """
+    def touch_adjoint(m: Model, s: int, links: Links, touch: Touch, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
+        """Return the wrench of two nearest points, see pair_list.contact_adjoint."""
         x1, a1, a2, d = touch.x1, touch.a1, touch.a2, touch.d
-        E, length, along, size = contact_frame(touch.side * d)
-        n = vec3(E[0, 2], E[1, 2], E[2, 2])
+        length = wp.length(d)
         half = T(0.5) * T(m.row_shape[s][1] - m.row_shape[s][2])
-        g_n = normal_adjoint(E, along, size, g_turn) + half * (g_p - wp.dot(g_p, n) * n)
+        g_n = g_n + half * (g_p - wp.dot(g_p, n) * n)
         g_d = pick(T(TINY), length, touch.side / length, T(0.0)) * g_n + g_r * n
         g2 = T(0.5) * g_p + g_d
         free1 = pick(wp.abs(touch.s1), T(1.0), pick(T(0.0), wp.dot(a1, a1), T(1.0), T(0.0)), T(0.0))
         free2 = pick(wp.abs(touch.s2), T(1.0), pick(T(0.0), wp.dot(a2, a2), T(1.0), T(0.0)), T(0.0))
-        first, second = slide_adjoint(x1 + touch.s1 * a1, d, a1, a2, free1, free2, T(0.5) * g_p - g_d, g2)
-        if has_box(m, s):
+        wrench = slide_adjoint(x1 + touch.s1 * a1, d, a1, a2, free1, free2, T(0.5) * g_p - g_d, g2)
+        if has_box(m, s):  # whose point follows the sphere along its free axes
             point, free, R, found = box_point(m, s, links, x1 - touch.x2)
-            followed = force_at(x1, R * wp.cw_mul(free, wp.transpose(R) * g2))
-            first = first + followed
-            second = second - followed
-        return first, second
+            wrench = wrench - force_at(x1, R * wp.cw_mul(free, wp.transpose(R) * g2))
+        return wrench
 
     return functions(locals())

@@ -61,20 +61,24 @@ def pair_list(spec: KernelSpec) -> SimpleNamespace:
         return number
 
     @wp.func
-    def contact_adjoint(m: Model, c: int, links: Links, contacts: Contacts, g_p: vec3, g_r: T, g_turn: vec3):
-        """Return the adjoints of both links' poses, see touch_adjoint of pair_geometry.py."""
+    def contact_adjoint(m: Model, c: int, links: Links, contacts: Contacts, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
+        """Return the adjoint of the second link's pose beside a first one that stays, as a wrench.
+
+        Those of the contact's point are g_p, of its distance g_r, of its normal n g_n. It moves rigidly with both links
+        together, so that the first one's wrench follows (pair_adjoint.py).
+        """
         kind = m.row_shape[contacts[c].row][9]
         if wp.static(TWO_BOXES):
             if kind == U(BOXES):
-                return boxes.boxes_adjoint(m, c, contacts, g_p, g_r, g_turn)
+                return boxes.boxes_adjoint(m, c, contacts, n, g_p, g_r, g_n)
         if wp.static(PARALLELS):
             if kind == U(PARALLEL):
-                return capsules.parallel_adjoint(m, c, links, contacts, g_p, g_r, g_turn)
+                return capsules.parallel_adjoint(m, c, links, contacts, n, g_p, g_r, g_n)
         if wp.static(CAPSULE_BOXES):
             if kind == U(CAPSULE_BOX):
-                return capsules.capsule_box_adjoint(m, c, links, contacts, g_p, g_r, g_turn)
+                return capsules.capsule_box_adjoint(m, c, links, contacts, n, g_p, g_r, g_n)
         s = contacts[c].row
-        return geometry.touch_adjoint(m, s, links, geometry.nearest_points(m, s, links), g_p, g_r, g_turn)
+        return geometry.touch_adjoint(m, s, links, geometry.nearest_points(m, s, links), n, g_p, g_r, g_n)
 
     @wp.func
     def depth_of(c: int, contacts: Contacts):

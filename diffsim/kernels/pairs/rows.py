@@ -124,8 +124,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         end = listed.list_blocks(m, here, links, contacts)
         for c in range(here.begin, end):
             s = contacts[c].row
-            i = m.row_link[2 * s]
-            j = m.row_link[2 * s + 1]
+            i, j = geometry.ends(m, s)
             D, rest = rest_of(m, here, c, links, contacts)
             velocity = geometry.rates(m, c, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
             jar = constants(m, here, s)[1] * velocity + rest
@@ -154,8 +153,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         """Turn the tree's Newton step into that with the rows between bodies."""
         if here.end > here.begin:
             for c in range(here.begin, here.end):
-                i = m.row_link[2 * contacts[c].row]
-                j = m.row_link[2 * contacts[c].row + 1]
+                i, j = geometry.ends(m, contacts[c].row)
                 A, B = motions[i].A, motions[j].A
                 contacts[c].rate = geometry.rates(m, c, contacts, A, B, motions[i].u, motions[j].u)
             solver.solve(m, here, links, contacts, motions, root.L, status.active, T(ACCURACY))
@@ -177,8 +175,7 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         total[3] = contacts[here.begin + LAST].D  # no solution where a contact has no room
         for c in range(here.begin, here.end):
             s = contacts[c].row
-            i = m.row_link[2 * s]
-            j = m.row_link[2 * s + 1]
+            i, j = geometry.ends(m, s)
             step_jar = geometry.rates(m, c, contacts, motions[i].A, motions[j].A, motions[i].u, motions[j].u)
             jar = contacts[c].jar + alpha * step_jar
             f, H = law(m, here, s, contacts[c].D, jar, T(0.0))

@@ -47,8 +47,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     def spread(m: Model, c: int, contacts: Contacts, f: vec3, branches: Branches):
         """Add the rows' forces f to the right-hand side: to the links' bias forces, and to the joints' forces."""
         s = contacts[c].row
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = geometry.ends(m, s)
         first, second = geometry.wrenches(m, c, contacts, f)
         branches[i].twist = branches[i].twist + first
         branches[j].twist = branches[j].twist - second
@@ -59,8 +58,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     @wp.func
     def rates_of(m: Model, c: int, contacts: Contacts, branches: Branches):
         s = contacts[c].row
-        i = m.row_link[2 * s]
-        j = m.row_link[2 * s + 1]
+        i, j = geometry.ends(m, s)
         a, b = branches[i].twist, branches[j].twist
         return geometry.rates(m, c, contacts, a, b, branches[i].rate, branches[j].rate)
 
