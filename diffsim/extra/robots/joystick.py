@@ -167,6 +167,11 @@ class Joystick(Task):
         self._feet = Feet.of(self.load_robot().mj_model, names, device, dtype)
         self._rest = robot.height + self._feet.places(self._home)[:, 2]  # m, of the feet, which sink in
 
+    def named(self, obs: Tensor) -> dict[str, Tensor]:
+        """The parts of observations (..., obs_dim) by the names of obs_parts."""
+        names, sizes = zip(*self.obs_parts, strict=True)
+        return dict(zip(names, obs.split(sizes, dim=-1), strict=True))
+
     @classmethod
     def has_mirror(cls) -> bool:
         return True
@@ -286,10 +291,12 @@ class Joystick(Task):
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Both velocities, then an upright, level, calm root at its height; the reference's joints and feet, no slip,
         legs that do not cross, smooth actions."""
-        n, legs = self._n, len(self.robot.legs)
-        command, private = obs[..., 9 + 3 * n : 12 + 3 * n], obs[..., 14 + 3 * n :]
-        parts = private.split((3, 3, 3, n, n, 1, n, n, bool(self.robot.apart), legs, legs), dim=-1)
-        velocity, angular, gravity, _, _, height, change, error, gap, lift, slip = parts
+        part = self.named(obs)
+        velocity, angular, gravity = (
+            part[f"true_{name}"] for name in ("base_lin_vel", "base_ang_vel", "projected_gravity")
+        )
+        command, height, change = part["command"], part["height"], part["action_change"]
+        error, lift, slip = part["joints_from_reference"], part["feet_from_reference"], part["feet_slip"]
         speed = score((velocity[..., :2] - command[..., :2]).square().sum(-1), 0.03)
         yaw = score((angular[..., 2] - command[..., 2]).square(), 0.03)
         calm = 0.5 * score(velocity[..., 2].square(), 0.5) + 0.2 * score(angular[..., :2].square().sum(-1), 4.0)
@@ -298,7 +305,7 @@ class Joystick(Task):
         gait = 1.2 * score(error.square(), 0.05).mean(-1) + self.smooth * score(change.square().mean(-1), 0.2)
         feet = 0.4 * score(lift.square(), 0.0004).mean(-1) + 0.15 * slip.mean(-1)
         if self.robot.apart:
-            feet = feet + score((self.robot.apart - gap[..., 0]).clamp(min=0.0).square(), 0.003)
+            feet = feet + score((self.robot.apart - part["feet_apart"][..., 0]).clamp(min=0.0).square(), 0.003)
         return self.alive - 0.5 * speed - 0.25 * yaw - calm - level - gait - feet
 
     def metadata(self) -> dict[str, str]:
@@ -314,8 +321,8 @@ class Joystick(Task):
 
     def terminated(self, obs: Tensor) -> Tensor:
         """Tilted by more than 60 degrees, or the root below 60 % of its height."""
-        private = obs[..., 14 + 3 * self._n :]
-        return (private[..., 8] > -0.5) | (private[..., 9 + 2 * self._n] < 0.6 * self.robot.height)
+        part = self.named(obs)
+        return (part["true_projected_gravity"][..., 2] > -0.5) | (part["height"][..., 0] < 0.6 * self.robot.height)
 
 
 class Go1(Joystick):
