@@ -21,9 +21,10 @@ import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.training import checkpoint, graph
-from diffsim.training.directory import check_writable, say
+from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
+from diffsim.training.log import say
 
 GAIT = "diffsim_cli.gait:report"
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training

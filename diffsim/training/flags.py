@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import torch
 import tyro
 
-from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
+from diffsim.tasks import FILE, TASKS, Accuracy, Contact, Task, base_name, find_task
 from diffsim.training import checkpoint
 from diffsim.training.errors import fail, in_one_line
 from diffsim.training.ranges import Count, Natural, Range, check_ranges, flag
@@ -74,15 +75,20 @@ class Flags:
         """The task's name without options: tables of defaults are by it."""
         return base_name(self.env)
 
+    @functools.cached_property
+    def task_class(self) -> type[Task]:
+        """The task: a file's code runs once, and options are read once."""
+        return find_task(self.env)
+
     def task_defaults(self) -> dict[str, Any]:
         """Return defaults that depend on other flags, such as the task, the device or the preset."""
-        return {"symmetric": find_task(self.env).symmetric} if hasattr(self, "symmetric") else {}
+        return {"symmetric": self.task_class.symmetric} if hasattr(self, "symmetric") else {}
 
     def check(self) -> None:
         """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""
         if self.contact == "mujoco" and self.implicit:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
-        if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
+        if getattr(self, "symmetric", False) and not self.task_class.has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
 
     @classmethod
@@ -116,9 +122,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         except (AttributeError, KeyError, TypeError) as error:
             fail(f"{path} is damaged: {error}")
     else:
-        task = find_task(args.env)
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
-            args.contact = task.contact
+            args.contact = args.task_class.contact
         defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
         args = _cli(kind, argv, defaults)
     check_ranges(args)
@@ -131,7 +136,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 def _presets(args: Flags) -> dict[str, Any]:
     """Look up what --accuracy and --contact stand for."""
     try:
-        how = find_task(args.env).integration(args.accuracy, args.contact)
+        how = args.task_class.integration(args.accuracy, args.contact)
     except ValueError as error:
         fail(error)
     return {"substeps": how.substeps, "implicit": how.implicit}
