@@ -14,7 +14,8 @@ OPTIONAL = """kernels/mujoco/constraint kernels/newton kernels/laws/drag kernels
 kernels/thread/division kernels/thread/exchange kernels/mujoco/cone kernels/thread/records kernels/pairs/rows
 kernels/pairs/adjoint kernels/pairs/geometry kernels/pairs/solver kernels/pairs/listing kernels/pairs/capsules
 kernels/pairs/boxes kernels/parameters kernels/laws/clamp kernels/transmission robot/actuator robot/pairs
-robot/constraint robot/terrain robot/drag sim/tangent sim/adjoint sim/elevation kernels/tree/branches""".split()
+robot/constraint robot/terrain robot/drag sim/tangent sim/adjoint sim/elevation sim/onset
+kernels/tree/branches""".split()
 
 
 def lines(*patterns: str) -> int:

@@ -71,7 +71,7 @@ class Launcher:
         self.num_blocks = -(-num_envs // block)
         with building:
             self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
-            self._model = model_of(scene, division, real, str(self.device))
+            self._model, self._division = model_of(scene, division, real, str(self.device)), division
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
         work = num_envs * how.substeps * scene.nlink

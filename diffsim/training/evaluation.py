@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import json
 import pkgutil
 from collections.abc import Callable
@@ -26,9 +25,8 @@ from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
 
 GAIT = "diffsim.extra.gait:report"
+RETAINED = "diffsim.extra.retained:compare"
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
-FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit
-ENOUGH = 0.97  # share of the return that must survive
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 
@@ -37,7 +35,7 @@ SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 class Evaluation:
     """One episode each of n environments."""
 
-    compared: ClassVar[bool] = True  # at a run's end and with --evaluate, with one at FINER times the substeps
+    compared: ClassVar[bool] = True  # at a run's end and with --evaluate, see extra/retained.py
 
     returns: Tensor  # (n,) undiscounted
     lengths: Tensor  # (n,) control steps
@@ -74,13 +72,6 @@ class Evaluation:
         """qpos (T, nq) and action (T, nu) of all steps of an episode."""
         steps = int(self.lengths[number])
         return self.qpos[:steps, number].numpy(force=True), self.action[:steps, number].numpy(force=True)
-
-
-def kept(own: float, finer: float) -> float:
-    """Share of its own return that a policy keeps with finer substeps; of costs, returns below 0, the inverse ratio."""
-    if own > 0:
-        return finer / own
-    return own / finer if finer < 0 else 1.0
 
 
 class Player:
@@ -159,7 +150,10 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 
 
 def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, seed: int = 0, **others: Any) -> DiffEnv:
-    """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
+    """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script.
+
+    Contacts begin as in the file: --onset is the training's, in `Run.make_env`.
+    """
     options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
     options["threads"] = args.threads or None
     try:
@@ -180,8 +174,8 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
     torch.set_num_threads(1)
     path, state = args.evaluate, checkpoint.load(args.evaluate, args.script())
 
-    def measure(flags: Args) -> Evaluation:
-        env = make_env(flags, flags.eval_episodes)
+    def measure(flags: Args, **options: Any) -> Evaluation:
+        env = make_env(flags, flags.eval_episodes, **options)
         if learner is None:
             return evaluate(env, fitting(checkpoint.load_policy(path).network, env))
         checkpoint.restore(restored := learner(flags, env), state)
@@ -190,28 +184,7 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
     evaluation = measure(args)
     pkgutil.resolve_name(checkpoint.PROVENANCE).compare(state.get("robot"), evaluation.scene)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    write_evaluation(args, evaluation, state["iteration"], **compare_finer(args, evaluation, measure))
-
-
-def compare_finer(args: Args, evaluation: Evaluation, measure: Callable[[Args], Evaluation]) -> dict[str, Any]:
-    """Print how much of its return a policy keeps at FINER times the substeps, without --implicit.
-
-    One that keeps less than ENOUGH has learned to exploit the integrator's errors.
-
-    Args:
-        measure: evaluates the policy with other arguments.
-
-    Returns:
-        for evaluation.json: the finer substeps, the return there and the share that is kept.
-    """
-    if not evaluation.compared:
-        return {}
-    substeps = FINER * args.substeps
-    value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
-    share = kept(evaluation.returns.median().item(), value)
-    warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-    say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{warning}")
-    return {"finer": {"substeps": substeps, "return": value, "kept": share}}
+    write_evaluation(args, evaluation, state["iteration"], **pkgutil.resolve_name(RETAINED)(args, evaluation, measure))
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:

@@ -12,9 +12,8 @@ from learners import SCRIPTS
 from numpy.typing import NDArray
 
 from diffsim import Scene, load_scene
-from diffsim.extra import gait
+from diffsim.extra import gait, retained
 from diffsim.tasks.base import ASSETS
-from diffsim.training import evaluation
 from diffsim.training.checkpoint import POLICIES
 
 Array = NDArray[np.float64]
@@ -160,4 +159,4 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
             parts.setdefault(row["part"], {})[row["number"]] = float(row["value"])
     assert [*parts] == [*(f"foot_{k}" for k in (1, 2, 3, 4)), "robot"] and table == gait.lines(parts)
     assert returns.startswith("ant, 2 episodes")
-    assert evaluation.kept(4.0, 2.0) == evaluation.kept(-2.0, -4.0) == 0.5 and evaluation.kept(-1.0, 0.0) == 1.0
+    assert retained.kept(4.0, 2.0) == retained.kept(-2.0, -4.0) == 0.5 and retained.kept(-1.0, 0.0) == 1.0
