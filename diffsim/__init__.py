@@ -80,11 +80,13 @@ def make(
         horizon: largest number of differentiable steps between two calls of DiffEnv.detach.
         contact: "soft" (penalty law) or "mujoco" (MuJoCo's constraints). Default: the task's, "mujoco" for go1, go2,
             g1, g1_track and tasks of your own, "soft" for the others.
-        accuracy: preset "fast" (soft contact only), "default" (the papers') or "accurate", see docs/numerics.md.
+        accuracy: preset of the integration, "fast" (soft contact only), "default" (the papers') or "accurate", see
+            docs/numerics.md.
         substeps, implicit, tolerance, onset: replace parts of the preset, see Integration.
         penalty: constants of the penalty law that replace the MJCF's, e.g. {"k_n": 1e5}, see docs/physics.md.
         dtype: torch.float32 or torch.float64.
-        terrain: vertices (x, z) [m] of the ground, (K, 2), or (N, K, 2) for each environment, see docs/physics.md.
+        terrain: replaces the task's ground: vertices (x, z) [m] of one profile, (K, 2), or of one for each
+            environment, (N, K, 2), see docs/physics.md.
         control_dt: seconds of a control step. Default: the task's.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task reports a fall.
@@ -139,10 +141,10 @@ EPISODE_STEPS = {"cartpole": 240, "g1_track": 500}  # of the others Task.episode
 # Two ids of each task: gymnasium.make makes the same environment of both, gymnasium.make_vec one on tensors and one in
 # NumPy, which has an id of its own because many libraries take an id and no further argument.
 for _name in TASKS:
-    for _suffix, _vector in (("", "diffsim:make"), ("-numpy", "diffsim.extra.numpy_env:make_vec")):
+    for _suffix, _vector in (("", "diffsim:make"), ("-numpy", "diffsim.numpy_env:make_vec")):
         gymnasium.register(
             id=f"diffsim/{_name.title().replace('_', '')}{_suffix}-v0",
-            entry_point="diffsim.extra.numpy_env:make_one",
+            entry_point="diffsim.numpy_env:make_one",
             vector_entry_point=_vector,
             max_episode_steps=EPISODE_STEPS.get(_name, Task.episode_length),
             kwargs={"name": _name},

@@ -25,14 +25,13 @@ from test_pairs import (
 
 import diffsim
 import shac
-from diffsim.extra import retained
-from diffsim.extra.parameters import ParametricSimulator
-from diffsim.extra.watch import make_policy_env
+from diffsim.parameters import ParametricSimulator
 from diffsim.robot.constraint import constrained, soften
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.training import Evaluation, graph, load_policy
+from diffsim.training import Evaluation, evaluation, graph, load_policy
 from diffsim.training import parse as parse_flags
+from diffsim_cli.watch import make_policy_env
 
 enough_passes = test_constraint.enough_passes
 ONSET = 0.02  # m
@@ -300,7 +299,7 @@ def test_what_is_retained_of_the_return_with_the_onset(monkeypatch, capsys):
         return result(200.0 if onset else 99.0)
 
     args = shac.Args(contact="mujoco", onset=0.03, substeps=4)
-    found = retained.compare(args, result(100.0), measure)
+    found = evaluation.compare(args, result(100.0), measure)
     assert found["onset"] == {"metres": 0.03, "return": 200.0, "kept": 0.5}
     assert found["finer"] == {"substeps": 16, "return": 99.0, "kept": 0.99}
     assert capsys.readouterr().out.splitlines() == [
@@ -308,7 +307,7 @@ def test_what_is_retained_of_the_return_with_the_onset(monkeypatch, capsys):
         "the training's onset of 0.03 m: return median 200.0, 50.0% retained without; less than 97%: train with a "
         "smaller --onset",
     ]
-    assert retained.compare(shac.Args(substeps=4), result(100.0), measure).keys() == {"finer"}
+    assert evaluation.compare(shac.Args(substeps=4), result(100.0), measure).keys() == {"finer"}
 
 
 def test_checkpoints_without_an_onset_load(tmp_path):

@@ -99,6 +99,13 @@ class Launcher:
                 for first, end in self._shares
             ]
 
+    def rewrite(self, scene: Scene, names: Iterable[str], columns: slice = slice(None)) -> None:
+        """Copy arrays of a scene with the same kernels, or their columns, to where the kernels read them."""
+        model = model_of(scene, self._division, self.spec.dtype, "cpu")
+        for name in names:
+            if (array := getattr(self._model, name, None)) is not None:
+                wp.to_torch(array)[..., columns].copy_(wp.to_torch(getattr(model, name))[..., columns])
+
     def batch(self, parts: Iterable[torch.Tensor]) -> Any:
         """Make the kernels' struct Batch of its fields."""
         Batch = types(self.spec).Batch

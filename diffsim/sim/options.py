@@ -24,7 +24,8 @@ class Options(NamedTuple):
         factors: let constants of the scene differ between environments: Simulator.factors.
         forces: let external forces act on the bodies: Simulator.forces.
         block: environments that a CPU thread steps at once in vectors of float32, 1, 8 or 16; default the fastest.
-        division: (threads_per_env, sharers), how GPU threads share an environment, see divide; default the fastest.
+        division: (threads_per_env, sharers) of kernels.lanes.divide, how GPU threads share an environment; default the
+            fastest as measured.
     """
 
     integration: Integration = Integration()

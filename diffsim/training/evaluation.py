@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import pkgutil
 from collections.abc import Callable
@@ -24,9 +25,10 @@ from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
 
-GAIT = "diffsim.extra.gait:report"
-RETAINED = "diffsim.extra.retained:compare"
+GAIT = "diffsim_cli.gait:report"
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
+FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit
+ENOUGH = 0.97  # share of the return that must survive
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 
@@ -35,7 +37,7 @@ SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 class Evaluation:
     """One episode each of n environments."""
 
-    compared: ClassVar[bool] = True  # at a run's end and with --evaluate, see extra/retained.py
+    compared: ClassVar[bool] = True  # at a run's end and with --evaluate, with one at FINER times the substeps
 
     returns: Tensor  # (n,) undiscounted
     lengths: Tensor  # (n,) control steps
@@ -72,6 +74,13 @@ class Evaluation:
         """qpos (T, nq) and action (T, nu) of all steps of an episode."""
         steps = int(self.lengths[number])
         return self.qpos[:steps, number].numpy(force=True), self.action[:steps, number].numpy(force=True)
+
+
+def kept(own: float, finer: float) -> float:
+    """Share of its own return that a policy keeps with finer substeps; of costs, returns below 0, the inverse ratio."""
+    if own > 0:
+        return finer / own
+    return own / finer if finer < 0 else 1.0
 
 
 class Player:
@@ -184,7 +193,38 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
     evaluation = measure(args)
     pkgutil.resolve_name(checkpoint.PROVENANCE).compare(state.get("robot"), evaluation.scene)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    write_evaluation(args, evaluation, state["iteration"], **pkgutil.resolve_name(RETAINED)(args, evaluation, measure))
+    write_evaluation(args, evaluation, state["iteration"], **compare(args, evaluation, measure))
+
+
+def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluation]) -> dict[str, Any]:
+    """Print how much of its return a policy keeps at FINER times the substeps, without --implicit.
+
+    One that keeps less than ENOUGH has learned to exploit the integrator's errors. After training with --onset, print
+    also how much of the return with that onset is left on the file's own contact, on which policies are evaluated.
+
+    Args:
+        measure: evaluates the policy with other arguments, and options of diffsim.make.
+
+    Returns:
+        for evaluation.json: the finer substeps, or the onset, with the return there and the share that is kept.
+    """
+    if not evaluation.compared:
+        return {}
+    own, substeps = evaluation.returns.median().item(), FINER * args.substeps
+    value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
+    share = kept(own, value)
+    say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{_warning(share, 'more substeps')}")
+    found = {"finer": {"substeps": substeps, "return": value, "kept": share}}
+    if args.onset:
+        value = measure(args, onset=args.onset).returns.median().item()
+        share, onset = kept(value, own), f"the training's onset of {args.onset:g} m"
+        say(f"{onset}: return median {value:.1f}, {share:.1%} retained without{_warning(share, 'a smaller --onset')}")
+        found["onset"] = {"metres": args.onset, "return": value, "kept": share}
+    return found
+
+
+def _warning(share: float, remedy: str) -> str:
+    return "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with {remedy}"
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:

@@ -27,7 +27,7 @@ from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
 from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, lock, make_unused, say
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import RETAINED, Evaluation, Player, make_env, write_evaluation
+from diffsim.training.evaluation import Evaluation, Player, compare, make_env, write_evaluation
 from diffsim.training.flags import Flags
 from diffsim.training.graph import Mark
 from diffsim.training.layers import ObsNormalizer
@@ -182,7 +182,7 @@ class Run:
         See graph.capture.
         """
         if self.args.compile:
-            function = pkgutil.resolve_name("diffsim.extra.fuse:fused")(function, self._learner, env)
+            function = pkgutil.resolve_name("diffsim.training.fuse:fused")(function, self._learner, env)
         call = graph.capture(function, self.device, env) if self.graphs and not eager else function
 
         def timed() -> Metrics:
@@ -423,7 +423,6 @@ class Run:
             say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} continues")
         elif self._evaluation:
             evaluation, player = self._evaluation[1], self._player
-            compare = pkgutil.resolve_name(RETAINED)
             found = compare(args, evaluation, self._evaluate_again) if player is not None else {}
             write_evaluation(args, evaluation, self.iteration, **found)
 
