@@ -23,7 +23,7 @@ from diffsim.training.checkpoint import Learner
 from diffsim.training.clock import Mark
 from diffsim.training.directory import RunDirectory
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import Evaluation, Player, compare_finer, make_env, write_evaluation
+from diffsim.training.evaluation import Evaluation, Player, compare, make_env, write_evaluation
 from diffsim.training.flags import Flags
 from diffsim.training.log import ProgressLog, say
 from diffsim.training.recorder import TOTALS, Recorder
@@ -94,7 +94,7 @@ class Run:
         if num_envs % processes:
             fail(f"--num-envs {num_envs} cannot be split evenly among {processes} processes")
         seed, varied_by = distributed.own_seed(self.args.seed), self.args.task_class.varied_by
-        options["factors"] = varied_by is not None
+        options |= {"factors": varied_by is not None, "onset": self.args.onset}
         self._env = make_env(self.args, num_envs // processes, horizon, seed, **options)
         if varied_by is not None:
             self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
@@ -276,13 +276,13 @@ class Run:
             say(f"stopped early: python {args.script()}.py --resume {self.directory.checkpoint} continues")
         elif self._evaluation:
             evaluation, player = self._evaluation[1], self._player
-            found = compare_finer(args, evaluation, self._evaluate_finer) if player is not None else {}
+            found = compare(args, evaluation, self._evaluate_again) if player is not None else {}
             write_evaluation(args, evaluation, self.iteration, **found)
 
-    def _evaluate_finer(self, args: Flags) -> Evaluation:
-        """Evaluate the policy of the last evaluation once more, in environments of other arguments."""
+    def _evaluate_again(self, args: Flags, **options: Any) -> Evaluation:
+        """Evaluate the policy of the last evaluation once more, in environments of other arguments and options."""
         assert self._player is not None
-        return Player(make_env(args, args.eval_episodes), self._player.policy, self.graphs).evaluate()
+        return Player(make_env(args, args.eval_episodes, **options), self._player.policy, self.graphs).evaluate()
 
     # When it cannot go on --------------------------------------------------------------------------------------------
 
