@@ -22,6 +22,7 @@ from diffsim.robot.scene import Scene
 from diffsim.sim.adjoint import ClipAdjoint
 from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration, check_count, is_real
+from diffsim.sim.launcher import check_memory
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
@@ -125,6 +126,9 @@ class DiffEnv(VectorEnv):
         self._pinned: State | None = None
         self._disturb = self.task.disturb
         # Start states of the next steps, drawn for many at once: one batch of operations, not one per step
+        numbers = task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory
+        drawn = f"start states of a horizon of {horizon:,} steps"
+        check_memory(drawn, num_envs, horizon * numbers * self.dtype.itemsize, self.device)
         self._starts = deque(self._draw_starts(horizon))
 
     @property

@@ -89,7 +89,8 @@ class Simulator:
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
         self._end_widths = scene.nq, scene.nv + hard  # with constraints a column for the residual
-        check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
+        kept = f"states and actions of a horizon of {horizon:,} steps"
+        check_memory(kept, n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
         self._launcher = Launcher(self._with_contact(scene, how), n, self.options)
         self._factors, self._forces = self._zeros(n, width) + 1, self._zeros(n, bodies, 6)
         self._start, self._g_start = self._zeros(slots, n, sum(self._widths)), self._zeros(n, sum(self._widths))
