@@ -33,6 +33,8 @@ L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
 Iterate = Callable[[], Metrics]
 
+ONSET_EVERY = 10  # iterations between two lengths of the onset
+
 
 def is_due(iteration: int, every: int) -> bool:
     return every > 0 and iteration % every == 0
@@ -94,7 +96,7 @@ class Run:
         if num_envs % processes:
             fail(f"--num-envs {num_envs} cannot be split evenly among {processes} processes")
         seed, varied_by = distributed.own_seed(self.args.seed), self.args.task_class.varied_by
-        options |= {"factors": varied_by is not None, "onset": self.args.onset}
+        options |= {"factors": varied_by is not None, "onset": self.args.onset[0]}
         self._env = make_env(self.args, num_envs // processes, horizon, seed, **options)
         if varied_by is not None:
             self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
@@ -122,6 +124,7 @@ class Run:
             distributed.generator(self.device).set_state(own["rng"])
             self.iteration = state["iteration"]
             self.recorder.load_state_dict(state)
+            self._set_onset(self.iteration + 1)
         return learner
 
     def capture(self, function: Iterate, env: DiffEnv | None = None, eager: bool = False) -> Iterate:
@@ -154,6 +157,8 @@ class Run:
                 self.iteration += 1
                 if self._variation is not None:
                     self._variation.set(self.iteration)
+                if is_due(self.iteration - 1, ONSET_EVERY):
+                    self._set_onset(self.iteration)
                 yield self.iteration
                 # Ranks write after the same iterations, as only then they learn of signals.
                 saving = self.iteration == self.last or is_due(self.iteration, self.args.save_every)
@@ -180,6 +185,13 @@ class Run:
 
     def _evaluates(self) -> bool:
         return self.iteration == self.args.iterations or is_due(self.iteration, self.args.eval_every)
+
+    def _set_onset(self, iteration: int) -> None:
+        """Let contacts begin as far along the way from the first onset to the last as the stage of an iteration is."""
+        first, last = self.args.onset
+        if self._env is not None and first != last:
+            done = (iteration - 1) // ONSET_EVERY * ONSET_EVERY / self.args.iterations
+            self._env.sim.set_onset(first + (last - first) * done)
 
     def log(self, metrics: Mapping[str, Tensor | float], control_steps: int | None = None) -> None:
         """Take an iteration's metrics; those of its episodes come from the environment of `make_env`.
