@@ -23,7 +23,8 @@ def find_weight(learner: Learner) -> str | None:
 
 def find_observation(learner: Learner | None, env: DiffEnv | None) -> int | None:
     """Return the first column of observations that is not finite, or was not in those that normalizers have seen."""
-    modules = nn.ModuleList(part for part in vars(learner).values() if isinstance(part, nn.Module)).modules()
+    own = () if learner is None else vars(learner).values()
+    modules = nn.ModuleList(part for part in own if isinstance(part, nn.Module)).modules()
     seen = [m.mean.unsqueeze(0) for m in modules if isinstance(m, ObsNormalizer) and m.size is not None]
     seen += [env.state_dict()["obs"]] if env is not None else []
     columns = [(~obs.isfinite()).any(0).nonzero().flatten().tolist() for obs in seen]
