@@ -34,7 +34,6 @@ PER_TASK = {
     "ant":          ((128, 64, 32), 128, 32, 4e-3, True,  2000),
     "humanoid":     ((256, 128),    128, 32, 2e-3, True,  2000),
     "humanoid_mtu": ((512, 256),    128, 16, 2e-3, True,  2000),
-    "humanoid_imitation": ((256, 128),    128, 32, 2e-3, True,  2000),
 }
 # fmt: on
 BETAS = 0.7, 0.95  # Adam's decay rates of the gradient's first and second moment
@@ -62,7 +61,7 @@ class Args(Flags):
     """initial learning rate (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        return dict(zip(COLUMNS, PER_TASK[self.task], strict=True)) if self.task in PER_TASK else {}
+        return dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
 
 
 # Network --------------------------------------------------------------------------------------------------------------

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.symmetry.mirror import Mirror
-from diffsim.symmetry.networks import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.symmetry.networks import make_alike
 from diffsim.training import Run, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp, moments
@@ -38,11 +37,8 @@ PER_TASK = {
     "ant":          ((128, 64, 32),  2048,  32, 16384, 5, 0.01,  5000),
     "humanoid":     ((256, 128, 64), 1024,  32,  8192, 5, 0.0,   5000),
     "humanoid_mtu": ((512, 512, 256), 1024, 32,  8192, 6, 0.0,  20000),
-    "humanoid_imitation": ((256, 128, 64), 1024, 32, 8192, 5, 0.0, 5000),
-    "g1_track":     ((512, 256, 128), 4096, 24, 24576, 5, 0.0,   5000),
 }
 # fmt: on
-BALANCING = {"g1_track": {"initial_log_std": -1.0}}  # more noise throws it over
 CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more of each
 MAX_GRAD_NORM = 1.0
 TARGET_KL = 0.008  # the learning rate falls if a minibatch's KL divergence is above twice this, rises below half of it
@@ -84,10 +80,10 @@ class Args(Flags):
     """treat left and right alike: a mirrored state gets the mirrored action (per task; docs/sapo.md)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
-        return super().task_defaults() | values | BALANCING.get(self.task, {})
+        return values
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -105,16 +101,6 @@ class ActorCritic(nn.Module):
         self.own = None if seen is None else mlp(obs_dim, args.hidden, None, elu)  # features of V, which sees more
         self.mean, self.value = (nn.Sequential(nn.Linear(args.hidden[-1], n)) for n in (action_dim, 1))
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
-
-    def make_alike(self, mirror: Mirror) -> None:
-        """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
-        mirror_statistics(self.normalizer, mirror.obs)
-        for features in (self.features, self.own):
-            if features is not None:
-                mirror_inputs(features, mirror.obs)
-        mirror_outputs(self.mean, mirror.action)
-        mirror_outputs(self.value, mirror.value)
-        mirror_parameter(self, "log_std", mirror.action)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
@@ -159,7 +145,9 @@ class PPO:
         self.args, self.env = args, env
         self.actor_critic = ActorCritic(args, env).to(env.device)
         if args.symmetric:
-            self.actor_critic.make_alike(env.task.mirror)
+            both = self.actor_critic
+            inputs = [features for features in (both.features, both.own) if features is not None]
+            make_alike(env.task.mirror, both, inputs, both.mean, both.value)
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, MAX_GRAD_NORM, lr=args.lr)
