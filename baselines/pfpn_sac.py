@@ -89,7 +89,7 @@ class Args(Flags):
     """transitions in the replay buffer, over all environments"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, PER_TASK["humanoid"]), strict=True))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, PER_TASK["humanoid"]), strict=True))
         rare = {"eval_every": 500, "save_every": 500}  # a checkpoint holds the replay buffer
         return values | rare | {"critic_hidden": values["hidden"]}
 
@@ -150,37 +150,49 @@ def logsumexp(x: Tensor) -> Tensor:
     return (x.gather(-1, largest) - F.log_softmax(x, -1).gather(-1, largest)).squeeze(-1)
 
 
-class Head(nn.Module):
-    """Features of a network (..., inputs) -> the mixture of each of m actions. What of it depends on the state:
+# A head takes features of a network (..., inputs) to the mixture of each of m actions. Its `layers` take them to u of
+# the largest weights.
 
-    pfpn      the weights (Figure 2)
-    gaussian  location and scale of its only component
-    """
+
+class ParticleHead(nn.Module):
+    """PFPN: the weights depend on the state, locations and scales are the same in all states (Figure 2)."""
 
     def __init__(self, args: Args, inputs: int, actions: int) -> None:
         super().__init__()
-        self.policy, self.shape = args.policy, (actions, args.particles if args.policy == "pfpn" else 1)
-        if self.policy == "gaussian":
-            self.linear, self.scale = nn.Linear(inputs, actions), nn.Linear(inputs, actions)
-        else:
-            loc, log_std = spread(*self.shape)
-            self.linear, self.likeliest = nn.Linear(inputs, loc.numel()), Likeliest(*self.shape)
-            nn.init.trunc_normal_(self.linear.weight, std=0.01, a=-0.02, b=0.02)  # almost constant
-            nn.init.zeros_(self.linear.bias)
-            self.loc.data.copy_(loc)
-            self.log_std = nn.Parameter(log_std)
+        self.shape = actions, args.particles
+        loc, log_std = spread(*self.shape)
+        self.linear, self.likeliest = nn.Linear(inputs, loc.numel()), Likeliest(*self.shape)
+        self.layers = [self.linear, self.likeliest]
+        nn.init.trunc_normal_(self.linear.weight, std=0.01, a=-0.02, b=0.02)  # almost constant
+        nn.init.zeros_(self.linear.bias)
+        self.loc.data.copy_(loc)
+        self.log_std = nn.Parameter(log_std)
 
     @property
     def loc(self) -> nn.Parameter:
-        """(m, n) the particles' locations."""
+        """Return the particles' locations (m, n)."""
         return self.likeliest.get_parameter("loc")
 
     def forward(self, features: Tensor) -> Mixture:
-        out = self.linear(features)
-        if self.policy == "gaussian":
-            log_std = self.scale(features).unsqueeze(-1).clamp(*LOG_STD)
-            return Mixture(torch.zeros_like(log_std), out.unsqueeze(-1), log_std)
-        return Mixture(out.unflatten(-1, self.shape), self.loc, self.log_std)
+        return Mixture(self.linear(features).unflatten(-1, self.shape), self.loc, self.log_std)
+
+
+class GaussianHead(nn.Module):
+    """A Gaussian, whose location and scale depend on the state."""
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        self.shape = actions, 1
+        self.linear, self.scale = nn.Linear(inputs, actions), nn.Linear(inputs, actions)
+        self.layers = [self.linear]
+
+    def forward(self, features: Tensor) -> Mixture:
+        loc, log_std = self.linear(features).unsqueeze(-1), self.scale(features).unsqueeze(-1).clamp(*LOG_STD)
+        return Mixture(torch.zeros_like(log_std), loc, log_std)
+
+
+Head = ParticleHead | GaussianHead
+HEADS: dict[str, type[Head]] = {"pfpn": ParticleHead, "gaussian": GaussianHead}
 
 
 def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
@@ -199,16 +211,15 @@ class Actor(nn.Module):
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.body = mlp(obs_dim, args.hidden, None, nn.ReLU, columns=seen)
-        self.head = Head(args, args.hidden[-1], action_dim)
+        self.head = HEADS[args.policy](args, args.hidden[-1], action_dim)
 
     def forward(self, obs: Tensor) -> Mixture:
         mixture: Mixture = self.head(self.body(obs))
         return mixture
 
     def deterministic(self) -> nn.Sequential:
-        """The actions of the largest weights, of observations as they come, with the same weights."""
-        likeliest = [self.head.likeliest] if self.head.policy == "pfpn" else []
-        return nn.Sequential(self.normalizer, *self.body, self.head.linear, *likeliest, nn.Tanh())
+        """Return the actions of the largest weights, of observations as they come, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.body, *self.head.layers, nn.Tanh())
 
 
 class Draw(NamedTuple):
@@ -277,7 +288,7 @@ class Resampling(nn.Module):
 
     def __init__(self, args: Args, head: Head) -> None:
         super().__init__()
-        self.args, self.active = args, args.policy == "pfpn"  # a Gaussian has nothing to move
+        self.args, self.active = args, type(head) is ParticleHead  # a Gaussian has nothing to move
         self.seen: Tensor = nn.Buffer(torch.zeros(2, *head.shape))  # since the last one: sum and largest of weights
         self.age: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # iterations
         self.moved: Tensor = nn.Buffer(torch.zeros(()))  # particles, ever
@@ -292,7 +303,7 @@ class Resampling(nn.Module):
     @torch.no_grad()
     def end_iteration(self, head: Head, optimizer: ClippedAdam) -> dict[str, Tensor]:
         """Resample if it is time; that is decided on the device, so a captured iteration does the same."""
-        if not self.active:
+        if type(head) is not ParticleHead:
             return {}
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
@@ -310,7 +321,7 @@ class Resampling(nn.Module):
             "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
         }
 
-    def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
+    def move(self, head: ParticleHead, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
         """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
 
         |D| copies share the weight of their target: log(|D| + 1) less in each logit. Adam's moments of them are zeroed.
