@@ -99,7 +99,7 @@ class Args(Flags):
         if self.device != "cpu":
             values |= ON_GPU.get(self.like, {})
         if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
-            _, values["substeps"], values["implicit"], _ = INTEGRATION[self.task]
+            _, values["substeps"], values["implicit"], *_ = INTEGRATION[self.task]
         if self.contact == "mujoco":
             values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
         return values
