@@ -79,7 +79,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not noiseless)
 
     def sample_noise(self, *shape: int) -> Tensor:
-        """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
+        """Draw reparameterised noise (*shape, action_dim) of a rollout, differentiable in log_std (A.1)."""
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
@@ -140,7 +140,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def bptt_loss(reward: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 8 without its value, of (H, N) steps: the discount restarts after each done."""
+    """Compute Eq. 8 without its value, of (H, N) steps: the discount restarts after each done."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)

@@ -116,7 +116,7 @@ class Mixture:
         self.loc, self.log_std = loc, log_std  # (..., m, n) or (m, n)
 
     def sample(self) -> Tensor:
-        """Actions (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
+        """Draw actions (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
         noise, std = torch.randn_like(self.logits[..., 0]), self.log_std.exp()
         if self.logits.shape[-1] == 1:  # a Gaussian
             return self.loc.squeeze(-1) + std.squeeze(-1) * noise
@@ -127,17 +127,17 @@ class Mixture:
         return loc + scale * noise
 
     def log_density(self, action: Tensor) -> Tensor:
-        """Of each action by itself (..., m)."""
+        """Compute the log density of each action by itself (..., m)."""
         rate = (-self.log_std).exp() * math.sqrt(0.5)
         z = torch.addcmul(-self.loc * rate, action.unsqueeze(-1), rate)
         return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
 
     def log_prob(self, action: Tensor) -> Tensor:
-        """log pi(a|s) (...) of actions (..., m)."""
+        """Compute log pi(a|s) (...) of actions (..., m)."""
         return self.log_density(action).sum(-1)
 
     def entropy(self) -> Tensor:
-        """Of the weights (appendix B), summed over the actions (...); of a single component its differential one."""
+        """Sum the weights' entropy (appendix B) over the actions (...), or a single component's differential one."""
         if self.logits.shape[-1] == 1:
             return (self.log_std + (1 + math.log(2 * math.pi)) / 2).sum((-1, -2))
         return -(self.log_weight.exp() * self.log_weight).sum((-1, -2))
@@ -152,7 +152,7 @@ class Bins(Mixture):
 
 
 def logsumexp(x: Tensor) -> Tensor:
-    """Over the last dimension. torch's own takes several times as long on a CPU where an exponential underflows."""
+    """Sum over the last dimension. torch's takes several times as long on a CPU where an exponential underflows."""
     largest = x.detach().argmax(-1, keepdim=True)
     return (x.gather(-1, largest) - F.log_softmax(x, -1).gather(-1, largest)).squeeze(-1)
 
@@ -230,7 +230,7 @@ HEADS = {"pfpn": ParticleHead, "gaussian": GaussianHead, "gmm": MixtureHead, "di
 
 
 def spread(actions: int, n: int, log_std: float | None = None) -> tuple[Tensor, Tensor]:
-    """Locations that cover each action evenly, and log standard deviations that cover the gaps between them (m, n).
+    """Return locations that cover each action evenly, and log standard deviations that cover their gaps (m, n).
 
     They cover [-1, 1], or as much as gives their mixture with equal weights a log standard deviation.
     """
@@ -244,7 +244,7 @@ def spread(actions: int, n: int, log_std: float | None = None) -> tuple[Tensor, 
 
 
 def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
-    """A layer that begins with small weights around an output."""
+    """Make a layer that begins with small weights around an output."""
     layer = nn.Linear(inputs, output.numel())
     nn.init.trunc_normal_(layer.weight, std=0.01, a=-0.02, b=0.02)
     layer.bias.data.copy_(output.flatten())
@@ -427,7 +427,7 @@ class PPO:
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, to a done or the rollout's end: the value and the generalized advantage.
+    """Compute TD(lambda) of (H, N) steps, to a done or the rollout's end: value plus generalized advantage.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """

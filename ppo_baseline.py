@@ -103,7 +103,7 @@ class ActorCritic(nn.Module):
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
+        """Return the mean (..., action_dim) and the normalized value (...) of normalized observations."""
         features = self.features(obs)
         return self.mean(features), self.value(features if self.own is None else self.own(obs)).squeeze(-1)
 
@@ -146,8 +146,7 @@ class PPO:
         self.actor_critic = ActorCritic(args, env).to(env.device)
         if args.symmetric:
             both = self.actor_critic
-            inputs = [features for features in (both.features, both.own) if features is not None]
-            make_alike(env.task.mirror, both, inputs, both.mean, both.value)
+            make_alike(env.task.mirror, both, (both.features, both.own), both.mean, both.value)
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, MAX_GRAD_NORM, lr=args.lr)
@@ -169,7 +168,7 @@ class PPO:
 
     @torch.no_grad()
     def act(self) -> tuple[Batch, Tensor]:
-        """Act for a rollout: its samples, and the share of the returns' variance that their values explain."""
+        """Act for a rollout; returns its samples, and the share of the returns' variance that their values explain."""
         args, policy, normalizer = self.args, self.actor_critic, self.actor_critic.normalizer
         noise = torch.randn(args.horizon, self.env.num_envs, policy.log_std.numel(), device=self.env.device)
         rollout = collect(self.env, policy, noise)
@@ -227,7 +226,7 @@ def collect(env: DiffEnv, policy: ActorCritic, noise: Tensor) -> Rollout:
 
 
 def gae(reward: Tensor, value: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at the dones and at the rollout's end.
+    """Compute advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at dones and at the rollout's end.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """
@@ -239,25 +238,25 @@ def gae(reward: Tensor, value: Tensor, next_value: Tensor, done: Tensor, gamma: 
 
 
 def log_ratio(batch: Batch, mean: Tensor, log_std: Tensor, old_log_std: Tensor) -> Tensor:
-    """log pi(a|s) / pi_old(a|s) (B,)."""
+    """Compute log pi(a|s) / pi_old(a|s) (B,)."""
     new = ((batch.action - mean) / log_std.exp()).square() / 2 + log_std
     old = ((batch.action - batch.mean) / old_log_std.exp()).square() / 2 + old_log_std
     return (old - new).sum(-1)
 
 
 def kl_divergence(old_mean: Tensor, old_log_std: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """KL(pi_old || pi) of diagonal Gaussians, mean over states."""
+    """Compute KL(pi_old || pi) of diagonal Gaussians, mean over states."""
     ratio = ((2 * old_log_std).exp() + (old_mean - mean).square()) / (2 * log_std).exp()
     return (log_std - old_log_std + (ratio - 1) / 2).sum(-1).mean()
 
 
 def clipped_loss(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
-    """Minus the clipped surrogate objective (Eq. 7), of pi(a|s) / pi_old(a|s) (B,)."""
+    """Compute minus the clipped surrogate objective (Eq. 7), of pi(a|s) / pi_old(a|s) (B,)."""
     return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
 
 
 def entropy(log_std: Tensor) -> Tensor:
-    """Of a diagonal Gaussian, in nats."""
+    """Compute the entropy of a diagonal Gaussian, in nats."""
     return (log_std + (1 + math.log(2 * math.pi)) / 2).sum(-1)
 
 

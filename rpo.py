@@ -121,7 +121,7 @@ class Actor(nn.Module):
 
     @property
     def deviation(self) -> Tensor:
-        """The numbers of log_std themselves, also where it is computed from them (--symmetric)."""
+        """Return the numbers of log_std themselves, also where it is computed from them (--symmetric)."""
         own = "parametrizations.log_std.original" if parametrize.is_parametrized(self, "log_std") else "log_std"
         return self.get_parameter(own)
 
@@ -265,7 +265,7 @@ def surrogate(bound: str, trust: float, b: Batch, mean: Tensor, std: Tensor, old
 
 
 def kl_divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """KL(pi_old || pi) of diagonal Gaussians, mean over states."""
+    """Compute KL(pi_old || pi) of diagonal Gaussians, mean over states."""
     ratio = (old_std.square() + (old_mean - mean).square()) / std.square()
     return ((std / old_std).log() + (ratio - 1) / 2).sum(-1).mean()
 
@@ -281,7 +281,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
+    """Compute SHAC's Eq. 5 of (H, N) steps: dones cut the rollouts, and the discount restarts after them."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)
@@ -293,7 +293,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
+    """Compute TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))

@@ -108,7 +108,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not noiseless)
 
     def sample_noise(self, *shape: int) -> Tensor:
-        """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
+        """Draw reparameterised noise (*shape, action_dim) of a rollout, differentiable in log_std (A.1)."""
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
@@ -148,7 +148,7 @@ class SHAC:
         self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
 
     def iterate(self) -> dict[str, Tensor]:
-        """One iteration of Algorithm 1; returns metrics.
+        """Take one iteration of Algorithm 1; returns metrics.
 
         It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
         """
@@ -183,7 +183,7 @@ class SHAC:
         }
 
     def next_values(self, rollout: Rollout) -> Tensor:
-        """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
+        """Return V(s_{t+1}) (H, N): of the last state where an episode's time ran out, zero where it terminated."""
         if self.args.critic_iterations == 0:
             return torch.zeros_like(rollout.reward)
         values = self.target(self.actor.normalizer(rollout.next_obs)).squeeze(-1)
@@ -213,7 +213,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 5 of (H, N) steps: each environment's rollout is cut at its dones, and the discount restarts after them."""
+    """Compute Eq. 5 of (H, N) steps: dones cut an environment's rollout, and the discount restarts after them."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)
@@ -225,7 +225,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the rollout's end does."""
+    """Compute Eq. 7 of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))

@@ -110,42 +110,42 @@ class Mixture:
         self.loc, self.log_std = loc, log_std  # (..., m, n) or (m, n)
 
     def sample(self) -> Tensor:
-        """u (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
+        """Draw u (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
         noise = torch.randn_like(self.logits[..., 0])
         if self.logits.shape[-1] == 1:  # a Gaussian
             return self.loc.squeeze(-1) + self.log_std.exp().squeeze(-1) * noise
         return self.pick(self.choose(), noise)
 
     def choose(self) -> Tensor:
-        """A component (..., m, 1) by its weight."""
+        """Draw a component (..., m, 1) by its weight."""
         total = self.logits.detach().softmax(-1).cumsum(-1)
         level = (1 - torch.rand_like(total[..., :1])) * total[..., -1:]
         return (total < level).sum(-1, keepdim=True)
 
     def pick(self, index: Tensor, noise: Tensor) -> Tensor:
-        """u (..., m) of the components (..., m, 1), with the gradient of their locations and scales."""
+        """Return u (..., m) of the components (..., m, 1), with the gradient of their locations and scales."""
         pair = self.loc, self.log_std.exp()
         loc, scale = (x.expand_as(self.logits).gather(-1, index).squeeze(-1) for x in pair)
         return loc + scale * noise
 
     def log_density(self, u: Tensor) -> Tensor:
-        """Of each u by itself (..., m)."""
+        """Compute the log density of each u by itself (..., m)."""
         rate = (-self.log_std).exp() * math.sqrt(0.5)
         z = torch.addcmul(-self.loc * rate, u.unsqueeze(-1), rate)
         return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
 
     def log_prob(self, u: Tensor) -> Tensor:
-        """log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
+        """Compute log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
         return (self.log_density(u) - log_slope(u)).sum(-1)
 
 
 def log_slope(u: Tensor) -> Tensor:
-    """log da/du."""
+    """Compute log da/du."""
     return 2 * (math.log(2) - u - F.softplus(-2 * u))
 
 
 def logsumexp(x: Tensor) -> Tensor:
-    """Over the last dimension. torch's own takes several times as long on a CPU where an exponential underflows."""
+    """Sum over the last dimension. torch's takes several times as long on a CPU where an exponential underflows."""
     largest = x.detach().argmax(-1, keepdim=True)
     return (x.gather(-1, largest) - F.log_softmax(x, -1).gather(-1, largest)).squeeze(-1)
 
@@ -196,7 +196,7 @@ HEADS: dict[str, type[Head]] = {"pfpn": ParticleHead, "gaussian": GaussianHead}
 
 
 def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
-    """Locations of u that cover each action evenly, and log standard deviations that cover their gaps (m, n)."""
+    """Return locations of u that cover actions evenly, and log standard deviations that cover their gaps (m, n)."""
     loc = torch.atanh(-1 + (2 * torch.arange(n, dtype=torch.float64) + 1) / n)
     gap = loc.diff()
     widest = torch.maximum(F.pad(gap, (1, 0)), F.pad(gap, (0, 1)))
@@ -231,13 +231,13 @@ class Draw(NamedTuple):
 
 
 def reparameterised(mixture: Mixture) -> Draw:
-    """A sample of a Gaussian."""
+    """Draw a sample of a Gaussian."""
     u = mixture.sample()
     return Draw(u, mixture.log_prob(u))
 
 
 def straight_through(mixture: Mixture) -> Draw:
-    """A sample whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
+    """Draw a sample whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
     noise = torch.randn_like(mixture.logits[..., 0])
     scores = mixture.logits - torch.empty_like(mixture.logits).exponential_().log()  # Gumbel noise
     u = mixture.pick(scores.argmax(-1, keepdim=True), noise)
@@ -250,7 +250,7 @@ def straight_through(mixture: Mixture) -> Draw:
 
 
 def implicit(mixture: Mixture) -> Draw:
-    """Samples whose gradient has no bias.
+    """Draw samples whose gradient has no bias.
 
     The value's is implicit (Figurnov et al. 2018, https://arxiv.org/abs/1805.08498). Few samples fall between narrow
     particles, where that is large. Therefore a second sample has one of the m actions from all of (-1, 1). The
@@ -269,7 +269,7 @@ def implicit(mixture: Mixture) -> Draw:
 
 
 def shift(mixture: Mixture, u: Tensor) -> Tensor:
-    """0 (B, m), with the gradient that u has if its cumulative probability F(u) stays: du = -dF / p(u).
+    """Return 0 (B, m), with the gradient that u has if its cumulative probability F(u) stays: du = -dF / p(u).
 
     Both samples of `implicit` divide by the sum of the densities with which they come (Veach's balance heuristic),
     p(u) and that of a constant density 1/2 of actions, for one of m. So the gradient of tanh u is at most 2m times dF.

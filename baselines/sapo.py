@@ -139,7 +139,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(start, requires_grad=not args.state_std)
 
     def forward(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Of normalized observations (K, B, obs_dim): the actions, and minus their log density per action (K, B)."""
+        """Return actions of normalized observations (K, B, obs_dim), and minus their log density per action (K, B)."""
         features = self.body(obs)
         log_std = self.log_std if self.spread is None else self.spread(features).clamp(*LOG_STD)
         u = self.mean(features) + log_std.exp() * noise
@@ -249,7 +249,7 @@ class SAPO:
             self.select(self.best)
 
     def select(self, member: int) -> None:
-        """From now on all members are this one, and learn from the samples of all."""
+        """Let all members be this one from now on, which learns from the samples of all."""
         for optimizer in self.optimizers:
             optimizer.tie(member)
         for p in self.targets.parameters():
@@ -328,17 +328,17 @@ class SAPO:
         return torch.stack(losses).mean()
 
     def values(self, critics: Ensemble, obs: Tensor) -> Tensor:
-        """Each critic's V (C, K, B) of normalized observations (K, B, obs_dim)."""
+        """Return each critic's V (C, K, B) of normalized observations (K, B, obs_dim)."""
         return critics(obs.repeat(self.args.critics, 1, 1)).squeeze(-1).unflatten(0, (self.args.critics, -1))
 
     def next_values(self, rollout: Rollout) -> Tensor:
-        """Each critic's V(s_{t+1}) (C, H, N): of an episode's last state where its time ran out, zero if terminated."""
+        """Return each critic's V(s_{t+1}) (C, H, N): of the last state where time ran out, zero where it terminated."""
         values = self.values(self.targets, self.members.samples(self.actor.normalizer(rollout.next_obs)))
         return self.members.rollout(values).masked_fill(rollout.terminated, 0.0)
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
+    """Compute SHAC's Eq. 5 of (H, N) steps: dones cut the rollouts, and the discount restarts after them."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)
@@ -350,7 +350,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
+    """Compute TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))

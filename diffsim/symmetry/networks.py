@@ -53,7 +53,7 @@ class SymmetricParameter(WithMirrorImage):
 def make_alike(
     mirror: Mirror,
     actor: nn.Module,
-    inputs: Sequence[Network],
+    inputs: Sequence[Network | None],
     action: Network,
     value: Network,
     size: Network | None = None,
@@ -63,14 +63,15 @@ def make_alike(
     Args:
         mirror: the task's.
         actor: has a `normalizer` of observations and a parameter `log_std`, a number per action.
-        inputs: the networks that observations enter.
+        inputs: the networks that observations enter; None is left out.
         action, value, size: those that end with actions, values, and numbers per action that have no direction.
     """
     normalizer = actor.get_submodule("normalizer")
     assert isinstance(normalizer, ObsNormalizer)
     mirror_statistics(normalizer, mirror.obs)
     for network in inputs:
-        mirror_inputs(network, mirror.obs)
+        if network is not None:
+            mirror_inputs(network, mirror.obs)
     mirror_outputs(action, mirror.action)
     mirror_outputs(value, mirror.value)
     if size is not None:
