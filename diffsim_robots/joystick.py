@@ -326,10 +326,16 @@ class Joystick(Task):
 
 
 # Learners begin near the standing pose, with little noise.
-BEGIN: dict[str, Any] = {"critic_hidden": (256, 128), "critic_lr": 1e-3, "initial_log_std": -2.0, "adjoint_clip": 5.0}
+BEGIN: dict[str, Any] = {
+    "critic_hidden": (256, 128),
+    "critic_lr": 1e-3,
+    "target_alpha": 0.9,
+    "initial_log_std": -2.0,
+    "adjoint_clip": 5.0,
+}
 BEGIN_RPO = BEGIN | {"horizon": 16, "num_envs": 64, "critic_iterations": 4, "epochs": 4, "trust": 0.5}
 QUADRUPED: Defaults = {
-    "shac": BEGIN | {"target_alpha": 0.9, "iterations": 600},
+    "shac": BEGIN | {"iterations": 600},
     "shac gpu": {"num_envs": 1024, "iterations": 1000},
     "rpo": BEGIN_RPO | {"iterations": 400},
     "rpo gpu": {"num_envs": 1024},
@@ -357,17 +363,10 @@ class G1(Joystick):
     alive, smooth = 2.5, 1.0
     ranges = {name: Joystick.ranges[name] for name in ("friction", "mass", "motor", "latency")} | {"push": (0.5, 1.5)}
     defaults: ClassVar[Defaults] = {
-        "shac": BEGIN | {"horizon": 16, "target_alpha": 0.9, "iterations": 1500},
+        "shac": BEGIN | {"horizon": 16, "iterations": 1500},
         "rpo": BEGIN_RPO | {"initial_log_std": -3.0, "iterations": 600},
         "rpo gpu": {"num_envs": 1024},
-        "sapo": BEGIN
-        | {
-            "horizon": 16,
-            "target_entropy": (-1.0, -1.0),
-            "target_alpha": 0.9,
-            "critic_iterations": 4,
-            "iterations": 1200,
-        },
+        "sapo": BEGIN | {"horizon": 16, "target_entropy": (-1.0, -1.0), "critic_iterations": 4, "iterations": 1200},
         "sapo gpu": {"num_envs": 1024},
         "sapo cpu": {"iterations": 700},
     }
