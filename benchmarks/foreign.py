@@ -27,8 +27,9 @@ from diffsim.extra.gait import trace
 from diffsim.extra.report import ROUGH_SHAPES, approximations
 from diffsim.robot.contact import ground_pairs
 from diffsim.robot.elements import control_range
-from diffsim.robot.pairs import as_primitives, touching
+from diffsim.robot.pairs import touching
 from diffsim.robot.scene import Array, Scene
+from diffsim.robot.shapes import as_primitives
 from diffsim.sim.integration import Integration
 from diffsim.training import fail
 
