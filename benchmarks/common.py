@@ -17,13 +17,13 @@ import tyro
 from tables import ROOT, Row
 
 from diffsim import DiffEnv
-from diffsim.extra.variation import on_a_plane
-from diffsim.extra.watch import make_policy_env
 from diffsim.sim.options import check_device
 from diffsim.tasks import FILE, TaskError, find_task
 from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy
 from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
+from diffsim_cli.watch import make_policy_env
+from diffsim_robots.variation import on_a_plane
 
 RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
 OUTPUT = ROOT / "runs" / "benchmarks"
@@ -144,6 +144,7 @@ class Case(NamedTuple):
         learner += " --symmetric" if args.get("symmetric") else ""
         learner += " randomised" if self.env.task.varied_by else ""
         learner += f" --initial-log-std {first:g}" if (first := args.get("initial_log_std")) else ""
+        learner += " --onset {:g} {:g}".format(*onset) if any(onset := args.get("onset", ())) else ""
         if not FILE.fullmatch(args["env"]) and (slope := getattr(find_task(args["env"]), "slope", 0.0)):
             learner += f" rough {slope:g}"
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))

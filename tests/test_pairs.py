@@ -16,7 +16,6 @@ from scenes import free_states, parse, pendulum, random_tree, robot
 from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, mujoco_model, step
 from test_gradient import gradients, weights
 
-from diffsim.extra.report import approximations, report
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
 from diffsim.robot.pairs import with_pairs
@@ -24,6 +23,7 @@ from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.robot.shapes import as_primitives
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
+from diffsim_cli.report import approximations, report
 
 enough_passes = test_constraint.enough_passes
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs
@@ -259,13 +259,13 @@ def test_robots_that_touch_themselves_step_as_in_mujoco(base, cone, seeds, rng):
     assert "geoms_rows" in constrained(scene, H).features
 
 
-def check_gradients_of_touching(scene, states, rng):
+def check_gradients_of_touching(scene, states, rng, onset=0.0):
     """Compare gradients with differences in the six calmest states in which something touches."""
     ends, apart = (in_mujoco(scene, *states, substeps=4, model=make(scene))[1] for make in MODELS)
     touches = abs(ends - apart).max(1) > 1e-3
     calm = np.argsort(np.where(touches, abs(ends).max(1), np.inf))[:6]
     assert touches[calm].all()
-    check_gradients(scene, [x[calm] for x in states], rng)
+    check_gradients(scene, [x[calm] for x in states], rng, onset=onset)
 
 
 @pytest.mark.parametrize("base, cone, seeds", TANGLES)
