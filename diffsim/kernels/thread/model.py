@@ -199,7 +199,7 @@ FIELDS: dict[str, Field] = {
     ),
     "base_damping": ("real", lambda n: n.scene.base_damping[0]),  # of a floating base
     **_scenes("vec3", "gravity"),  # m/s^2
-    **_scenes("real", "k_n k_d k_t mu"),  # soft contact, see contact.py
+    **_scenes("real", "k_n k_d k_t mu"),  # soft contact, see soft_contact.py
 }
 
 

@@ -101,7 +101,7 @@ def add_constraints(
         structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
     if spec.constrained:
         structs["Node"] |= {
-            "B": vec6,  # sum of S qacc, the twist that gives J a (constraint.py)
+            "B": vec6,  # sum of S qacc, the twist that gives J a (mujoco/impedance.py)
             "qacc": T,  # the joint's acceleration before damping
         }
         structs["Adjoint"] |= {"b": vec6}  # B
@@ -109,7 +109,7 @@ def add_constraints(
             "accel_link": vec6,  # acceleration of the link, of Newton's iterate
             "contacts_begin": int,  # of the link's contacts in their list
             "contacts_end": int,
-            "limit": vec3,  # the limit's row, see constraint.limit_state
+            "limit": vec3,  # the limit's row, see limits.limit_state
             "accel_joint": T,  # acceleration of the joint, of Newton's iterate
             "free_force": T,  # force of the joint without constraints
             "con_force": T,  # force of its constraints
