@@ -23,8 +23,8 @@ from torch import Tensor
 from diffsim import DiffEnv
 from diffsim.extra.planning import REAL, System
 from diffsim.extra.terrain import incline, rough
+from diffsim.robot.profile import TerrainError
 from diffsim.robot.scene import Array, Scene
-from diffsim.robot.terrain import TerrainError
 from diffsim.sim.elevation import Elevation
 from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import Evaluation

@@ -21,7 +21,7 @@ from test_pairs import needs_drift
 import diffsim
 import rpo
 from diffsim.extra.commands import main as diffsim_main
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.training import load_policy
 
 enough_passes = test_constraint.enough_passes

@@ -14,7 +14,7 @@ OPTIONAL = """kernels/newton kernels/parameters kernels/transmission kernels/law
 kernels/laws/force kernels/laws/terrain kernels/mujoco/cone kernels/mujoco/ground kernels/mujoco/impedance
 kernels/mujoco/limits kernels/pairs/adjoint kernels/pairs/boxes kernels/pairs/capsules kernels/pairs/geometry
 kernels/pairs/listing kernels/pairs/rows kernels/pairs/solver kernels/thread/division kernels/thread/exchange
-kernels/thread/records kernels/tree/branches robot/actuator robot/constraint robot/drag robot/pairs robot/terrain
+kernels/thread/records kernels/tree/branches robot/actuator robot/constants robot/fluid robot/pairs robot/profile
 sim/adjoint sim/elevation sim/tangent""".split()
 
 

@@ -18,7 +18,7 @@ from test_gradient import gradients, weights
 
 from diffsim.extra.report import approximations, report
 from diffsim.robot import pairs as robot_pairs
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.robot.pairs import as_primitives, with_pairs
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim.integration import Integration

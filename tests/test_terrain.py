@@ -18,8 +18,8 @@ from diffsim.extra.drive import web
 from diffsim.extra.render import slabs
 from diffsim.extra.terrain import LENGTH, LEVEL, incline, rough, step, uneven
 from diffsim.extra.variation import Variation
+from diffsim.robot.profile import TerrainError
 from diffsim.robot.scene import FACTORS, Scene
-from diffsim.robot.terrain import TerrainError
 from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator

@@ -26,7 +26,7 @@ from diffsim.extra.export import export_onnx, export_policy
 from diffsim.extra.report import report as report_robot
 from diffsim.extra.tune import tune
 from diffsim.extra.watch import film_median, make_policy_env
-from diffsim.robot.constraint import check_soft, constrained
+from diffsim.robot.constants import check_soft, constrained
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Contact, base_name, find_task
 from diffsim.training import command, evaluate, fail, load_policy

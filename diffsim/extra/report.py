@@ -10,7 +10,8 @@ import numpy as np
 
 from diffsim.extra.gait import trace
 from diffsim.extra.own_task import start_control
-from diffsim.robot.contact import (
+from diffsim.robot.elements import control_range, label, listed, motors, muscles
+from diffsim.robot.geoms import (
     HULL_POINTS,
     base_geoms,
     contact_points,
@@ -18,7 +19,6 @@ from diffsim.robot.contact import (
     matrix_of,
     pair_law,
 )
-from diffsim.robot.elements import control_range, label, listed, motors, muscles
 from diffsim.robot.pairs import as_primitives, deviation, directions, is_exact, obstacle_geoms, reach, self_pairs
 from diffsim.robot.scene import Scene
 

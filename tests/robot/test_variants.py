@@ -13,7 +13,7 @@ from scenes import free_states, parse, random_tree, robot
 
 from diffsim import Integration, Scene, SceneError, Simulator
 from diffsim.extra.report import approximations
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.sim import simulator
 
 pytestmark = pytest.mark.unoptimized

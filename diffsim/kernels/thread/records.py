@@ -13,7 +13,7 @@ PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     for name, kind in (
         ("row_kind", "ints"),  # of each block
         ("row_partner", "ints"),  # the block that shares its violation, or itself
-        ("row_params", "vec11s"),  # as rows of robot.constraint.Constraints
+        ("row_params", "vec11s"),  # as rows of robot.constants.Constraints
         ("row_shape", "vec11s"),  # numbers of a joint's polynomial, of a weld or of two geoms
         ("row_first", "vec3s"),  # m, the point on the first link, in its frame
         ("row_second", "vec3s"),  # m, on the second one
