@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.extra.planning import (
+from diffsim.planning import (
     REAL,
     AfterStep,
     LinearGaussian,
@@ -34,10 +34,10 @@ from diffsim.extra.planning import (
     System,
     Tracking,
 )
-from diffsim.extra.planning.controller import gaussian_log_prob, maximum_entropy_controllers
-from diffsim.extra.planning.demonstration import follow_demonstration, load_demonstration
-from diffsim.extra.planning.ilqr import ilqr
-from diffsim.extra.planning.lbfgs import maximise
+from diffsim.planning.controller import gaussian_log_prob, maximum_entropy_controllers
+from diffsim.planning.demonstration import follow_demonstration, load_demonstration
+from diffsim.planning.ilqr import ilqr
+from diffsim.planning.lbfgs import maximise
 from diffsim.tasks import find_task
 from diffsim.tasks.base import ASSETS
 from diffsim.training import evaluate_checkpoint, fail, script

@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.extra.learning.likeliest import Likeliest
+from diffsim.learning.likeliest import Likeliest
 from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp, moments

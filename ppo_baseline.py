@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.extra.mirror import Mirror
-from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.symmetry.mirror import Mirror
+from diffsim.symmetry.networks import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
 from diffsim.training import Run, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp, moments

@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.extra.symmetry import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.symmetry.networks import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, mlp

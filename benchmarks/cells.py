@@ -110,7 +110,7 @@ class Runner:
         script, _, ranks = case.script.partition("@")
         torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}", "--"] if ranks else []
         stopping = ["-c", STOPPING, str(until)] if until else []
-        command = [sys.executable, *torchrun, *stopping, str(ROOT / f"{script}.py"), *map(str, arguments)]
+        command = [sys.executable, *torchrun, *stopping, str(tables.script_of(script)), *map(str, arguments)]
         command += ["--device", self.args.device]
         case.folder.mkdir(parents=True, exist_ok=True)
         with (case.folder / "output.txt").open("a") as output:
@@ -149,8 +149,8 @@ class Cell(NamedTuple):
     @property
     def command(self) -> str:
         _, task, seed, script, flags = self.case(Path())
-        device = "cpu" if self.machine == "cpu" else "cuda"
-        return " ".join((f"python {script}.py --env {task} --seed {seed} --device {device}", *flags))
+        path, device = tables.script_of(script).relative_to(ROOT), "cpu" if self.machine == "cpu" else "cuda"
+        return " ".join((f"python {path} --env {task} --seed {seed} --device {device}", *flags))
 
 
 def begin(runner: Runner, cell: Cell, case: Case) -> dict[str, object]:

@@ -17,13 +17,13 @@ import tyro
 from tables import ROOT, Row
 
 from diffsim import DiffEnv
-from diffsim.extra.variation import on_a_plane
-from diffsim.extra.watch import make_policy_env
 from diffsim.sim.options import check_device
 from diffsim.tasks import FILE, TaskError, find_task
 from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy
 from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
+from diffsim_cli.watch import make_policy_env
+from diffsim_robots.variation import on_a_plane
 
 RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
 OUTPUT = ROOT / "runs" / "benchmarks"

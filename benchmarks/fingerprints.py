@@ -23,8 +23,8 @@ import common
 import tables
 from tables import ROOT
 
-from diffsim.extra.commands import find_learners
 from diffsim.training import fail
+from diffsim_cli.commands import find_learners
 
 CASES = {name: f"{name} --env hopper --num-envs 16" for name in find_learners()}  # small trainings
 CASES |= {  # learners that need other flags
@@ -74,7 +74,7 @@ def fingerprint(checkout: Path, name: str, device: str = "cpu") -> str:
     """The hash of a case's policy, trained by the scripts of a checkout; empty if they do not train it."""
     script, *flags = CASES[name].split()
     with TemporaryDirectory() as folder:
-        words = [str(checkout / f"{script}.py"), *flags, *SMALL.format(device).split(), "--run-dir", folder]
+        words = [str(tables.script_of(script, checkout)), *flags, *SMALL.format(device).split(), "--run-dir", folder]
         call, paths = [sys.executable, "-c", TRAIN_AND_HASH, *words], {"PYTHONPATH": str(checkout)}
         done = subprocess.run(call, cwd=folder, env=os.environ | paths, capture_output=True, text=True)
     if done.returncode == 0:
@@ -127,8 +127,8 @@ def same_files(revision: str, other: str, script: str = "") -> bool:
 
     A revision that is not in history is the same as none.
     """
-    scripts = (f"{script}.py",) if script else (":(glob)*.py", ":!view.py")
-    paths = ":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view", *scripts
+    scripts = (f"{script}.py", f"baselines/{script}.py") if script else (":(glob)*.py", "baselines", ":!view.py")
+    paths = ":(glob)diffsim/**/*.py", ":(glob)diffsim_robots/**/*.py", "diffsim/assets", *scripts
     call = ["git", "diff", "--quiet", revision, other, "--", *paths]
     return subprocess.run(call, cwd=ROOT, stderr=subprocess.DEVNULL).returncode == 0
 

@@ -23,14 +23,14 @@ import tyro
 from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import SceneError, Simulator, load_scene
-from diffsim.extra.gait import trace
-from diffsim.extra.report import ROUGH_SHAPES, approximations
 from diffsim.robot.elements import control_range
 from diffsim.robot.geoms import ground_pairs
 from diffsim.robot.pairs import as_primitives, touching
 from diffsim.robot.scene import Array, Scene
 from diffsim.sim.integration import Integration
 from diffsim.training import fail
+from diffsim_cli.gait import trace
+from diffsim_cli.report import ROUGH_SHAPES, approximations
 
 STEP = 2.0**-10  # s: no acceleration reaches the speed at which a simulator contains a state
 EQUAL = 1e-6  # relative error below which a step counts as MuJoCo's

@@ -29,7 +29,7 @@ from gps_variants import CASES, Ground, VariantArgs, gps, named_terrains
 from tables import Cells, Row, grouped, markdown, numbers
 from torch import Tensor
 
-from diffsim.extra.planning import step_jacobian
+from diffsim.planning import step_jacobian
 from diffsim.training import checkpoint, parse
 from diffsim.training.evaluation import make_env
 

@@ -21,13 +21,13 @@ import torch
 import tyro
 from torch import Tensor
 
-from diffsim.extra.mirror import partners
-from diffsim.extra.planning import System, load_demonstration, save_demonstration
-from diffsim.extra.robots.walker import Walker
+from diffsim.planning import System, load_demonstration, save_demonstration
+from diffsim.symmetry.mirror import partners
 from diffsim.tasks.hopper import Hopper
 from diffsim.tasks.humanoid import Humanoid
 from diffsim.training import command, fail, load_policy, parse
 from diffsim.training.evaluation import make_env
+from diffsim_robots.walker import Walker
 
 ALIVE = 3.0  # per step: a fall costs the rest of the episode
 

@@ -21,13 +21,13 @@ from tables import ROOT
 from torch import Tensor
 
 from diffsim import DiffEnv
-from diffsim.extra.planning import REAL, System
-from diffsim.extra.terrain import incline, rough
+from diffsim.planning import REAL, System
 from diffsim.robot.profile import TerrainError
 from diffsim.robot.scene import Array, Scene
 from diffsim.sim.elevation import Elevation
 from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import Evaluation
+from diffsim_robots.terrain import incline, rough
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402

@@ -27,7 +27,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim import Scene, load_scene
-from diffsim.extra.parameters import ParametricSimulator
+from diffsim.parameters import ParametricSimulator
 from diffsim.robot.elements import control_range
 from diffsim.tasks.base import ASSETS
 from diffsim.training import fail, load_policy

@@ -30,13 +30,13 @@ from common import ABOUT, Case, Part, load_case, measured, run
 from tables import Row, grouped, middle, numbers
 from worlds import Array, OtherFile, State, in_double, pushes, rollout
 
-from diffsim.extra import gait
-from diffsim.extra.robots.joystick import Joystick
-from diffsim.extra.terrain import STEEPEST, uneven
 from diffsim.sim.elevation import Elevation
 from diffsim.training import Positive, fail
 from diffsim.training.checkpoint import HOME
 from diffsim.training.ranges import Range
+from diffsim_cli import gait
+from diffsim_robots.joystick import Joystick
+from diffsim_robots.terrain import STEEPEST, uneven
 
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
 COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) for v in SIDEWAYS)]

@@ -22,14 +22,14 @@ from common import TASKS, CommonFlags, Line, Panel, Part, Tasks, measured, plot,
 from tables import Cells, Row, grouped
 
 import diffsim
-from diffsim.extra.tune import actor, subject
-from diffsim.extra.tune.extremes import stress
-from diffsim.extra.tune.front import Row as Measured
-from diffsim.extra.tune.front import choice, finest, integrator, measure, settings
-from diffsim.extra.tune.motion import SPANS, Motion
 from diffsim.sim.integration import Integration
 from diffsim.tasks import Accuracy, find_task
 from diffsim.training import Count
+from diffsim_cli.tune import actor, subject
+from diffsim_cli.tune.extremes import stress
+from diffsim_cli.tune.front import Row as Measured
+from diffsim_cli.tune.front import choice, finest, integrator, measure, settings
+from diffsim_cli.tune.motion import SPANS, Motion
 
 PartName = Literal["presets", "extremes", "promise"]
 ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again

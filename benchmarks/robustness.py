@@ -25,9 +25,9 @@ from torch import Tensor
 from worlds import Here, State, Step, rollout, starts
 
 from diffsim import DiffEnv, Simulator
-from diffsim.extra.robots.imitation.task import HumanoidImitation
 from diffsim.training import Count, fail
 from diffsim.training.evaluation import SEED
+from diffsim_robots.imitation.task import HumanoidImitation
 
 WALK = (2.0, 4.0)  # s before the push
 PUSH = 0.1  # s

@@ -20,13 +20,13 @@ import tyro
 from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import Simulator
-from diffsim.extra.gait import trace
 from diffsim.robot.geoms import contact_points
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Array, Scene
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.training import Count
+from diffsim_cli.gait import trace
 
 STEPS, PERTURBED = 100, 1e-10  # m/s or rad/s
 CONES, INTEGRATORS, KINDS = ("pyramidal", "elliptic"), ("Euler", "implicitfast"), ("sphere", "capsule", "box", "mesh")

@@ -32,10 +32,10 @@ from tables import ROOT, Row
 
 import diffsim
 from diffsim import Scene, Simulator
-from diffsim.extra.terrain import rough
-from diffsim.extra.tune.front import clock
 from diffsim.sim.launcher import TooLargeError
 from diffsim.training import Count, Run, fail, graph
+from diffsim_cli.tune.front import clock
+from diffsim_robots.terrain import rough
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 TECHNIQUES = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"

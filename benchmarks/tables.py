@@ -28,6 +28,11 @@ Row = Mapping[str, object]
 Cells = dict[str, str]
 
 
+def script_of(learner: str, checkout: Path = ROOT) -> Path:
+    """The learner's script in a checkout; those of revisions before baselines/ all lie at the top."""
+    return path if (path := checkout / f"{learner}.py").is_file() else checkout / "baselines" / f"{learner}.py"
+
+
 def digits(value: object) -> str:
     if not isinstance(value, float):
         return str(value)

@@ -30,9 +30,9 @@ from joystick import alone, training
 from tables import Row, grouped, markdown, middle, numbers
 from worlds import Array, OtherFile, State, pushes, rollout
 
-from diffsim.extra.robots.imitation.clip import read_clip
-from diffsim.extra.robots.imitation.tracking import Tracking
 from diffsim.training import Count, SavedPolicy, fail
+from diffsim_robots.imitation.clip import read_clip
+from diffsim_robots.imitation.tracking import Tracking
 
 OFF = 0.05  # rad, of the joints at the start
 ENOUGH = 0.95  # share of episodes that succeed, to which learners race

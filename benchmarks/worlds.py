@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim import DiffEnv, Scene, Simulator, load_scene
-from diffsim.extra.render import slabs
 from diffsim.robot.elements import numeric
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Task
 from diffsim.training import fail
 from diffsim.training.evaluation import SEED
+from diffsim_cli.render import slabs
 
 Array = NDArray[np.float64]
 FASTEST = 1e5  # m/s or rad/s; beyond it a robot is lost, as in Simulator

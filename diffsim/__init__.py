@@ -140,10 +140,10 @@ EPISODE_STEPS = {"cartpole": 240, "g1_track": 500}  # of the others Task.episode
 # Two ids of each task: gymnasium.make makes the same environment of both, gymnasium.make_vec one on tensors and one in
 # NumPy, which has an id of its own because many libraries take an id and no further argument.
 for _name in TASKS:
-    for _suffix, _vector in (("", "diffsim:make"), ("-numpy", "diffsim.extra.numpy_env:make_vec")):
+    for _suffix, _vector in (("", "diffsim:make"), ("-numpy", "diffsim.numpy_env:make_vec")):
         gymnasium.register(
             id=f"diffsim/{_name.title().replace('_', '')}{_suffix}-v0",
-            entry_point="diffsim.extra.numpy_env:make_one",
+            entry_point="diffsim.numpy_env:make_one",
             vector_entry_point=_vector,
             max_episode_steps=EPISODE_STEPS.get(_name, Task.episode_length),
             kwargs={"name": _name},

@@ -28,7 +28,7 @@ from diffsim.tasks import Task
 State = tuple[Tensor, Tensor, Tensor, Tensor]  # qpos, qvel, observation and memory, (N, ...) each
 Step = tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]  # what gymnasium's step returns
 Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
-RENDERER = "diffsim.extra.render:Renderer"  # loaded with the first picture
+RENDERER = "diffsim_cli.render:Renderer"  # loaded with the first picture
 STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_statistics
 
 

@@ -15,12 +15,12 @@ import torch
 from own_quadruped import play
 from torch import Tensor
 
-from diffsim.extra.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, reflections
-from diffsim.extra.robots.common import score
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
+from diffsim.symmetry.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, reflections
 from diffsim.tasks import Task
 from diffsim.tasks.locomotion import rotate
+from diffsim_robots.common import score
 
 # A leg's five motors: hip roll, yaw and pitch, knee, foot. FOLD lifts a level foot by 0.13 m, STRIDE moves it forward.
 STIFFNESS, DAMPING = (150, 100, 200, 250, 60), (5, 4, 8, 8, 2)  # N m/rad, N m s/rad, of their servos

@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from diffsim.extra.robots.common import score
-from diffsim.extra.robots.joystick import Go2
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
+from diffsim_robots.common import score
+from diffsim_robots.joystick import Go2
 
 RADIUS, MASS, DRAG = 0.11, 0.43, 0.002  # m, kg, N s/m and N m s: a football of size 5 that comes to rest
 STIFFNESS, RANGE = 40.0, {"hip": (-0.4, 0.4), "thigh": (0.2, 1.6), "calf": (-2.5, -1.1)}  # N m/rad, rad: as of "go2"

@@ -12,14 +12,14 @@ import mujoco
 import torch
 from torch import Tensor
 
-from diffsim.extra.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, reflections
-from diffsim.extra.robots.common import score
-from diffsim.extra.robots.joystick import humanoid
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
+from diffsim.symmetry.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, reflections
 from diffsim.tasks import Task
 from diffsim.tasks.base import ASSETS
 from diffsim.tasks.locomotion import rotate
+from diffsim_robots.common import score
+from diffsim_robots.joystick import humanoid
 
 HEIGHT, LOWEST, REACH = 0.755, 0.3, 1.5  # m, of the pelvis, standing and lying at the start; rad, of targets from home
 LEGS, ARMS = (150.0, 5.0), (50.0, 2.0)  # N m/rad and N m s/rad of their servos; the waist has the legs'

@@ -18,7 +18,7 @@ import tyro
 from torch import Tensor
 
 from diffsim import Scene, load_scene
-from diffsim.extra.parameters import ParametricSimulator
+from diffsim.parameters import ParametricSimulator
 from diffsim.robot.elements import control_range
 from diffsim.sim.integration import Integration
 

@@ -10,11 +10,11 @@ from itertools import product
 
 import mujoco
 
-from diffsim.extra.robots.joystick import G1, humanoid
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.pairs import with_pairs
 from diffsim.robot.scene import Scene
 from diffsim.tasks.base import ASSETS
+from diffsim_robots.joystick import G1, humanoid
 
 LEG = "hip_roll", "hip_yaw", "knee", "ankle_roll"  # links whose first geoms touch those of the other leg
 

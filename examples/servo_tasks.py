@@ -13,10 +13,10 @@ from typing import ClassVar
 import mujoco
 from torch import Tensor
 
-from diffsim.extra.robots.imitation.task import HumanoidImitation
-from diffsim.extra.robots.joystick import Go2
 from diffsim.tasks import Contact
 from diffsim.tasks.base import ASSETS
+from diffsim_robots.imitation.task import HumanoidImitation
+from diffsim_robots.joystick import Go2
 
 STIFFNESS = 2.0  # 1/rad: a servo gives its motor's largest torque half a radian from the target
 

@@ -13,7 +13,7 @@ import tyro
 from torch import Tensor
 
 import diffsim
-from diffsim.extra.render import check_video, film
+from diffsim_cli.render import check_video, film
 
 STEPS = 90  # control steps of 1/60 s
 

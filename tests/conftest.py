@@ -13,8 +13,8 @@ import warp as wp
 from browser import CHROMIUM, Browser
 
 import shac
-from diffsim.extra import render
 from diffsim.training import Evaluation
+from diffsim_cli import render
 
 torch.set_num_threads(1)
 Evaluation.compared = False  # except in the tests of that

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
-from diffsim.extra.learning.replay import Transition
+from diffsim.learning.replay import Transition
 
 Array = NDArray[Any]
 

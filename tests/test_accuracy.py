@@ -13,7 +13,6 @@ from scenes import BALL, DISTINCT, DRONE, HINGE, OSCILLATOR, acting_states, leg_
 from warp._src.context import ModuleBuilder
 
 import diffsim
-from diffsim.extra.terrain import incline
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.thread.division import divide
@@ -21,6 +20,7 @@ from diffsim.kernels.thread.spec import kernel_spec
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
+from diffsim_robots.terrain import incline
 
 SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
 both_integrators = pytest.mark.parametrize("implicit", [False, True])

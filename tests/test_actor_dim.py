@@ -14,9 +14,9 @@ from learners import refusal
 
 import diffsim
 import gps
-from diffsim.extra.commands import find_learners
 from diffsim.tasks import TASKS
 from diffsim.training import parse
+from diffsim_cli.commands import find_learners
 
 
 def algorithm(script: str) -> Any:

@@ -20,9 +20,9 @@ from test_pairs import needs_drift
 
 import diffsim
 import rpo
-from diffsim.extra.commands import main as diffsim_main
 from diffsim.robot.constants import constrained
 from diffsim.training import load_policy
+from diffsim_cli.commands import main as diffsim_main
 
 enough_passes = test_constraint.enough_passes
 

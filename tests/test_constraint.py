@@ -33,8 +33,6 @@ from test_gradient import differences, gradients, weights
 from test_terrain import HILLS, everywhere, hopping, pressed
 
 import diffsim
-from diffsim.extra.gait import trace
-from diffsim.extra.terrain import incline
 from diffsim.kernels.mujoco import ground
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS, SceneError
@@ -42,6 +40,8 @@ from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.training.checkpoint import POLICIES, load_policy
+from diffsim_cli.gait import trace
+from diffsim_robots.terrain import incline
 
 ROBOTS = ("hopper", "half_cheetah", "ant", "humanoid")
 BASES = "floating", "fixed", "planar", "ball"

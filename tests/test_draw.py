@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from diffsim.extra.robots.joystick import Go2
 from diffsim.training.checkpoint import POLICIES
+from diffsim_robots.joystick import Go2
 
 
 def test_a_loop_ends_where_it_begins() -> None:

@@ -17,7 +17,7 @@ from scenes import task_scene
 from torch.autograd import forward_ad
 
 import diffsim
-from diffsim.extra.numpy_env import NumpyVectorEnv
+from diffsim.numpy_env import NumpyVectorEnv
 from diffsim.tasks import TASKS
 
 

@@ -29,10 +29,10 @@ from scenes import with_motors
 
 import diffsim
 from diffsim import load_scene
-from diffsim.extra.commands import POLICIES, main
-from diffsim.extra.parameters import ParametricSimulator
+from diffsim.parameters import ParametricSimulator
 from diffsim.tasks.base import ASSETS
 from diffsim.training import load_policy
+from diffsim_cli.commands import POLICIES, main
 
 EXAMPLES = ROOT / "examples"
 

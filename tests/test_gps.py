@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from extra.planning.systems import normal
 from learners import assert_refuses, assert_same, read_progress, run
+from planning.systems import normal
 from torch import Tensor
 
 import diffsim
 import gps
-from diffsim.extra.planning import LinearGaussian, System, save_demonstration
-from diffsim.extra.watch import make_policy_env
+from diffsim.planning import LinearGaussian, System, save_demonstration
 from diffsim.training import Evaluation, evaluate, load_policy, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
+from diffsim_cli.watch import make_policy_env
 from gps import log_mixture, phi, sparse
 
 SMALL = (

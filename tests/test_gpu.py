@@ -16,7 +16,6 @@ import warp as wp
 from scenes import SOFT, leg, parse, task_scene
 
 import diffsim
-from diffsim.extra.terrain import rough
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.thread.division import divide
@@ -28,6 +27,7 @@ from diffsim.robot.scene import FACTORS
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
+from diffsim_robots.terrain import rough
 
 HORIZON = 32
 KNEE = '<joint name="knee"'

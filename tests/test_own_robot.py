@@ -16,10 +16,10 @@ from learners import ROOT, refusal
 import diffsim
 import ppo_baseline
 import shac
-import view
-from diffsim.extra.commands import main as diffsim_main
 from diffsim.tasks.base import ASSETS
 from diffsim.training import checkpoint, load_policy, parse
+from diffsim_cli import view
+from diffsim_cli.commands import main as diffsim_main
 
 pytestmark = pytest.mark.unoptimized
 PAGE = (ROOT / "docs" / "own_robot.md").read_text()
@@ -52,10 +52,10 @@ def small(words: Sequence[str], run: Path | None = None, iterations: int = 2) ->
     return [*text.replace("runs/<run>", str(run)).split(), *(FEW if words[0] == LEARNER else ())]
 
 
-def test_the_page_is_short_and_lists_the_example() -> None:
-    assert len(PAGE.split()) <= 750 and LISTING in (ROOT / "examples" / "own_robot.py").read_text()
+def test_the_page_lists_the_example() -> None:
+    assert LISTING in (ROOT / "examples" / "own_robot.py").read_text()
     assert LISTING.count("\n") <= 30 and "class RunForward(Task):" in LISTING
-    first = "-m", "ppo_baseline.py", "view.py", "ppo_baseline.py", "ppo_baseline.py"
+    first = "-m", "ppo_baseline.py", "view", "ppo_baseline.py", "ppo_baseline.py"
     assert [words[0] for words in COMMANDS] == [
         *first,
         "clone",

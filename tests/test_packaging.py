@@ -20,7 +20,7 @@ import pytest
 from learners import PATH
 
 import diffsim
-from diffsim.extra.commands import find_learners
+from diffsim_cli.commands import find_learners
 
 pytest.importorskip("hatchling")
 
@@ -60,12 +60,12 @@ def build(kind: str, source: Path) -> Path:
 def test_the_wheel_holds_the_package_and_the_licenses(repository: list[str], source: Path) -> None:
     with ZipFile(build("wheel", source)) as wheel:
         names = set(wheel.namelist())
-    package = {name for name in repository if name.startswith("diffsim/")}
-    scripts = {name for name in repository if name.endswith(".py") and "/" not in name}
-    assert {f"{name}.py" for name in find_learners()} | {"view.py"} == scripts
-    package |= {f"diffsim/learners/{name}" for name in scripts}
+    package = {name for name in repository if name.startswith(("diffsim/", "diffsim_robots/", "diffsim_cli/"))}
+    scripts = {name for name in repository if re.fullmatch(r"(baselines/)?\w+\.py", name)}
+    assert {str(path.relative_to(ROOT)) for path in find_learners().values()} == scripts
+    package |= {f"diffsim_cli/learners/{name}" for name in scripts}
     assert {name for name in names if ".dist-info/" not in name} == package
-    needed = "py.typed", "assets/web.html", "assets/NOTICE", "policies/ant.pt", "policies/cards.csv"
+    needed = "py.typed", "assets/NOTICE", "policies/ant.pt", "policies/cards.csv"
     assert {f"diffsim/{name}" for name in needed} <= names
     licenses = {name.partition(".dist-info/licenses/")[2] for name in names} - {""}
     assert licenses == {"LICENSE", "NOTICE", *(f"licenses/{path.name}" for path in (ROOT / "licenses").iterdir())}
@@ -77,15 +77,11 @@ def test_the_source_distribution_holds_the_repository(repository: list[str], sou
     assert files - {"PKG-INFO"} == {*repository}
 
 
-def test_one_placeholder_stands_for_the_repository() -> None:
-    """The owner replaces OWNER/diffsim once; what names a version names today's."""
-    files = "pyproject.toml", "CITATION.cff", "README.md", "examples/first_steps.ipynb"
-    texts = {name: (ROOT / name).read_text() for name in files}
-    (owner,) = {match for text in texts.values() for match in re.findall(r"github\.com/([\w-]+/diffsim)\b", text)}
-    assert all(f"github.com/{owner}" in text for text in texts.values())
+def test_what_names_a_version_names_todays() -> None:
     version = diffsim.__version__
-    assert f"version: {version}\n" in texts["CITATION.cff"] and f"version = {{{version}}}" in texts["README.md"]
-    assert f"/v{version}/diffsim_rl-{version}-py3-none-any.whl" in texts["examples/first_steps.ipynb"]
+    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"version = {{{version}}}" in (ROOT / "README.md").read_text()
+    assert f"diffsim_rl-{version}-py3-none-any.whl" in (ROOT / "examples" / "first_steps.ipynb").read_text()
 
 
 def test_an_editable_install_is_found_from_every_folder(source: Path, tmp_path: Path) -> None:
@@ -106,13 +102,12 @@ def test_every_part_can_be_imported_by_its_name() -> None:
     import diffsim.robot.scene as scene
 
     assert scene.Scene is diffsim.Scene and diffsim.robot.scene is scene
-    for part in ("extra", "kernels", "robot", "sim", "tasks", "training"):
+    for part in ("kernels", "learning", "planning", "robot", "sim", "symmetry", "tasks", "training"):
         assert importlib.import_module(f"diffsim.{part}") is getattr(diffsim, part)
 
 
 def test_no_script_imports_another() -> None:
-    scripts = {path.stem: ast.walk(ast.parse(path.read_text())) for path in ROOT.glob("*.py")}
-    assert {*find_learners(), "view"} == scripts.keys()
+    scripts = {name: ast.walk(ast.parse(path.read_text())) for name, path in find_learners().items()}
     for name, nodes in scripts.items():
         for node in nodes:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
@@ -128,10 +123,10 @@ def below(part: str) -> set[str]:
 
 
 def core() -> dict[str, ast.Module]:
-    """The modules of the package except those of diffsim.extra, by their names."""
+    """The modules of the package, by their names."""
     package = Path(diffsim.__file__).parent
     paths = (path.relative_to(package.parent).with_suffix("") for path in package.rglob("*.py"))
-    names = [".".join(path.parts).removesuffix(".__init__") for path in paths if path.parts[1] != "extra"]
+    names = [".".join(path.parts).removesuffix(".__init__") for path in paths]
     files = {name: importlib.util.find_spec(name) for name in names}
     return {name: ast.parse(Path(str(spec.origin)).read_text()) for name, spec in files.items() if spec}
 
@@ -147,15 +142,15 @@ def imports(name: str, tree: ast.Module) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def test_the_core_does_not_import_the_extras() -> None:
+def test_the_package_imports_neither_robots_nor_commands() -> None:
     """Neither in a function nor for types. What it uses of them it names in a string."""
     named = set()
     for name, tree in core().items():
-        found = [each for each in imports(name, tree) if re.match(r"diffsim\.extra(\.|$)", each)]
+        found = [each for each in imports(name, tree) if re.match(r"diffsim_(robots|cli)(\.|$)", each)]
         assert not found, f"{name} imports {found[0]}"
         texts = (node.value for node in ast.walk(tree) if isinstance(node, ast.Constant))
-        named |= {text for text in texts if isinstance(text, str) and re.fullmatch(r"diffsim(\.\w+)*:\w+", text)}
-    assert any(text.startswith("diffsim.extra.") for text in named)
+        named |= {text for text in texts if isinstance(text, str) and re.fullmatch(r"diffsim\w*(\.\w+)*:\w+", text)}
+    assert all(any(text.startswith(f"diffsim_{name}.") for text in named) for name in ("robots", "cli"))
     for text in named:
         assert callable(pkgutil.resolve_name(text)), text
 
@@ -170,9 +165,9 @@ def test_imports_go_down_the_drawing() -> None:
                 assert part == own or part in below(own), f"{name} imports {other}"
 
 
-def test_importing_the_package_loads_no_extra() -> None:
+def test_importing_the_package_loads_neither() -> None:
     modules = "diffsim, diffsim.tasks, diffsim.env"
-    program = f"import sys, {modules}; print([name for name in sys.modules if name.startswith('diffsim.extra')])"
+    program = f"import sys, {modules}; print([name for name in sys.modules if name.startswith('diffsim_')])"
     command = [sys.executable, "-c", program]
     found = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | PATH).stdout
     assert found.strip() == "[]"

@@ -16,13 +16,13 @@ from scenes import free_states, parse, pendulum, random_tree, robot
 from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, mujoco_model, step
 from test_gradient import gradients, weights
 
-from diffsim.extra.report import approximations, report
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constants import constrained
 from diffsim.robot.pairs import as_primitives, with_pairs
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
+from diffsim_cli.report import approximations, report
 
 enough_passes = test_constraint.enough_passes
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs

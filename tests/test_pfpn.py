@@ -8,7 +8,9 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import pfpn_sac
 import pytest
+import sac_baseline
 import torch
 from learners import assert_resumes, read_progress, run
 from problems import assert_soft_updates
@@ -17,9 +19,7 @@ from torch.distributions import Categorical, MixtureSameFamily, Normal
 
 import diffsim
 import pfpn
-import pfpn_sac
 import ppo_baseline
-import sac_baseline
 from diffsim.training import ClippedAdam, load_policy, parse
 
 each_script = pytest.mark.parametrize("script", [pfpn, pfpn_sac], ids=["ppo", "sac"])

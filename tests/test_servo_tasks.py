@@ -11,8 +11,8 @@ import servo_tasks
 import torch
 from tables import ROOT
 
-from diffsim.extra.robots.imitation.clip import read_clip
 from diffsim.tasks.base import ASSETS
+from diffsim_robots.imitation.clip import read_clip
 
 TROT = ROOT / "examples" / "dog_trot.npz"
 

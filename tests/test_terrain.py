@@ -13,16 +13,16 @@ from scenes import BALL, PENDULUM, acting_states, parse, run, task_scene, unit
 from test_gradient import check_gradients
 
 import diffsim
-from diffsim.extra import render
-from diffsim.extra.drive import web
-from diffsim.extra.render import slabs
-from diffsim.extra.terrain import LENGTH, LEVEL, incline, rough, step, uneven
-from diffsim.extra.variation import Variation
 from diffsim.robot.profile import TerrainError
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
+from diffsim_cli import render
+from diffsim_cli.drive import web
+from diffsim_cli.render import slabs
+from diffsim_robots.terrain import LENGTH, LEVEL, incline, rough, step, uneven
+from diffsim_robots.variation import Variation
 
 IMPLICIT = Integration("soft", 8, implicit=True)  # of the ball; the hopper is explicit, so that two kernels do for all
 # A valley, a ridge, a wall and a short segment; a ball of 0.1 m fits between all of them.

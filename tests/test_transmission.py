@@ -14,13 +14,13 @@ from test_dynamics import mujoco_acceleration, relative_error
 from test_gradient import check_gradients as check_soft_gradients
 from test_gradient import gradients, weights
 
-from diffsim.extra.mirror import reflections
-from diffsim.extra.own_task import start_control
-from diffsim.extra.parameters import ParametricSimulator
+from diffsim.parameters import ParametricSimulator
 from diffsim.robot.elements import control_range
 from diffsim.robot.scene import FACTORS, Scene, SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
+from diffsim.symmetry.mirror import reflections
+from diffsim.tasks.own_task import start_control
 
 EXACT = Integration("mujoco", 1, tolerance=1e-12)
 CASES = ["implicitfast", "Euler", "drone"]

@@ -17,9 +17,9 @@ import torch
 import tyro
 from tyro.conf import Positional
 
-from diffsim.extra.commands import POLICIES
-from diffsim.extra.robots.joystick import Joystick
 from diffsim.training import command, evaluate
+from diffsim_cli.commands import POLICIES
+from diffsim_robots.joystick import Joystick
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 import joystick  # noqa: E402

@@ -32,13 +32,13 @@ from PIL import Image, ImageDraw, ImageFont
 from tyro.conf import Positional
 
 from diffsim import Scene
-from diffsim.extra.commands import DEMO_EPISODES, POLICIES
-from diffsim.extra.gait import TOUCHING, contact_bodies, trace
-from diffsim.extra.render import BLUE, RED, Arrow, Frame, Renderer, drawable, whole_file
-from diffsim.extra.robots.imitation.tracking import Tracking
-from diffsim.extra.robots.joystick import Joystick
-from diffsim.extra.watch import make_policy_env
 from diffsim.training import command, evaluate, fail, load_policy
+from diffsim_cli.commands import DEMO_EPISODES, POLICIES
+from diffsim_cli.gait import TOUCHING, contact_bodies, trace
+from diffsim_cli.render import BLUE, RED, Arrow, Frame, Renderer, drawable, whole_file
+from diffsim_cli.watch import make_policy_env
+from diffsim_robots.imitation.tracking import Tracking
+from diffsim_robots.joystick import Joystick
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from cells import Cell, Runner, ScriptFlags  # noqa: E402

@@ -15,8 +15,8 @@ import numpy as np
 import tyro
 from tyro.conf import Positional
 
-from diffsim.extra.render import LOOKS
 from diffsim.tasks.base import ASSETS
+from diffsim_cli.render import LOOKS
 
 # Trunks, whose files stored copies of Menagerie lack: place of the centre, half of length, width and height [m].
 WHITE = 1.0, 1.0, 1.0, 1.0

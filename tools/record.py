@@ -16,10 +16,10 @@ import tyro
 from torch import Tensor
 from tyro.conf import Positional
 
-from diffsim.extra.render import whole_file
-from diffsim.extra.robots.imitation.clip import Clip, tangent
-from diffsim.extra.watch import make_policy_env
 from diffsim.training import command, evaluate, fail, load_policy
+from diffsim_cli.render import whole_file
+from diffsim_cli.watch import make_policy_env
+from diffsim_robots.imitation.clip import Clip, tangent
 
 SETTLING = 3.0  # s at the start of the episode that are left out
 SHORTEST = 0.3  # s

@@ -16,9 +16,9 @@ from record import close, cycle
 from torch import Tensor
 
 import diffsim
-from diffsim.extra.robots.imitation.clip import Clip
 from diffsim.tasks.base import ASSETS
 from diffsim.training import load_policy
+from diffsim_robots.imitation.clip import Clip
 
 COMMAND = (0.8, 0.0, 0.0)  # m/s forward, which the recorded dog follows
 PERIOD = 25  # control steps of go2 in a cycle of its gait

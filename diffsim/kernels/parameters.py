@@ -1,4 +1,4 @@
-"""Gradients by a scene's constants: of links, joints, motors and contacts, as extra/parameters.py asks for.
+"""Gradients by a scene's constants: of links, joints, motors and contacts, as diffsim/parameters.py asks for.
 
 In phi (backward.py) a link has W . (I a + v x* I v), and W1 . I D where damping follows the constraints. These are
 linear in the link's mass, first moments and moments of inertia about its origin. With x and y the twists about it,

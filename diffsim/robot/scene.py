@@ -135,7 +135,7 @@ class Scene:
     geom_pairs: tuple[tuple[int, int], ...] = ()  # of the robot's geoms that may touch each other, see robot/pairs.py
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constants.py
     transmissions: Transmissions | None = None  # actuators on fixed tendons and at sites, whose motor_link is 0
-    parameters: int = 0  # number of constants whose gradients the backward kernel computes, see extra/parameters.py
+    parameters: int = 0  # number of constants whose gradients the backward kernel computes, see diffsim/parameters.py
 
     @property
     def nlink(self) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from diffsim.tasks.base import Accuracy, Contact, Task, TaskError
 
 FILE = re.compile(r"(.+\.py)(?::(\w+))?")  # a task of your own: my_task.py or my_task.py:Class
-OWN_TASK = "diffsim.extra.own_task:task_of_file"
+OWN_TASK = "diffsim.tasks.own_task:task_of_file"
 REGISTERED = {
     "cartpole": "diffsim.tasks.cartpole:CartPole",
     "hopper": "diffsim.tasks.hopper:Hopper",
@@ -18,13 +18,13 @@ REGISTERED = {
     "humanoid": "diffsim.tasks.humanoid:Humanoid",
     "humanoid_mtu": "diffsim.tasks.humanoid_mtu:HumanoidMTU",
     # not in the paper
-    "swimmer": "diffsim.extra.robots.swimmer:Swimmer",
-    "walker": "diffsim.extra.robots.walker:Walker",
-    "humanoid_imitation": "diffsim.extra.robots.imitation.task:HumanoidImitation",
-    "go1": "diffsim.extra.robots.joystick:Go1",
-    "go2": "diffsim.extra.robots.joystick:Go2",
-    "g1": "diffsim.extra.robots.joystick:G1",
-    "g1_track": "diffsim.extra.robots.imitation.tracking:G1Track",
+    "swimmer": "diffsim_robots.swimmer:Swimmer",
+    "walker": "diffsim_robots.walker:Walker",
+    "humanoid_imitation": "diffsim_robots.imitation.task:HumanoidImitation",
+    "go1": "diffsim_robots.joystick:Go1",
+    "go2": "diffsim_robots.joystick:Go2",
+    "g1": "diffsim_robots.joystick:G1",
+    "g1_track": "diffsim_robots.imitation.tracking:G1Track",
 }
 
 

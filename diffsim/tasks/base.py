@@ -29,8 +29,9 @@ from diffsim.sim.integration import TOLERANCE, Contact, Integration, check_conta
 Accuracy = Literal["fast", "default", "accurate"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
-OPTIONS = "diffsim.extra.variation:configure"  # reads options after a task's name
-OWN_TASK = "diffsim.extra.own_task"  # checks tasks outside this package, centres actions
+OPTIONS = "diffsim_robots.variation:configure"  # reads options after a task's name
+OWN_TASK = "diffsim.tasks.own_task"  # checks tasks outside this package, centres actions
+OURS = "diffsim.", "diffsim_robots."  # modules whose tasks need no check
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
@@ -57,7 +58,7 @@ class Task:
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
     mirrored_by: ClassVar[str | None] = None  # "module:function" that makes its `mirror`
-    varied_by: ClassVar[str | None] = None  # "module:Class" of what a training changes, see extra/variation.py
+    varied_by: ClassVar[str | None] = None  # "module:Class" of what a training changes, see diffsim_robots/variation.py
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
     episode_length: ClassVar[int] = 1000  # control steps
@@ -88,7 +89,7 @@ class Task:
         if not isinstance(asset, str | os.PathLike):
             return load_scene(asset)
         beside = getattr(sys.modules.get(owner), "__file__", None) or "."
-        folders = [] if owner.startswith("diffsim.") else [Path(beside).resolve().parent, Path.cwd()]
+        folders = [] if owner.startswith(OURS) else [Path(beside).resolve().parent, Path.cwd()]
         for folder in (*folders, ASSETS):
             if (folder / asset).is_file():
                 return load_scene(folder / asset)
@@ -103,9 +104,9 @@ class Task:
         """Fit the task to its robot and return it: find missing start, num_random, obs_dim and forward_column.
 
         Raises:
-            TaskError: of a task outside this package, see extra/own_task.py.
+            TaskError: of a task outside this package, see tasks/own_task.py.
         """
-        own = None if type(self).__module__.startswith("diffsim.") else pkgutil.resolve_name(OWN_TASK)
+        own = None if type(self).__module__.startswith(OURS) else pkgutil.resolve_name(OWN_TASK)
         self.forward_column = getattr(self, "forward_column", way_forward(scene))
         if own is not None:
             own.check_attributes(self, scene.nq)
@@ -169,9 +170,9 @@ class Task:
 
     @cached_property
     def mirror(self) -> Any:
-        """Return the task's mirror image, left and right exchanged (extra/mirror.py); raises ValueError if it has none.
+        """Return the task's mirror image, left and right exchanged (symmetry/mirror.py).
 
-        It is made at the first call, which a CUDA graph cannot capture.
+        It is made at the first call, which a CUDA graph cannot capture. Raises ValueError if the task has none.
         """
         if self.mirrored_by is None:
             raise ValueError(f"task {self.name!r} has no mirror image")

@@ -31,7 +31,7 @@ class Locomotion(Task):
     observe_action: ClassVar[bool] = True
     target: ClassVar[float]  # m; the robot is to face the point (target, 0)
     sides: ClassVar[tuple[tuple[str, str], ...]]  # (right, left) beginnings or ends of names, see mirror
-    mirrored_by: ClassVar[str | None] = "diffsim.extra.mirror:mirror_of_locomotion"
+    mirrored_by: ClassVar[str | None] = "diffsim.symmetry.mirror:mirror_of_locomotion"
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         joints = len(self.start_joints)

@@ -24,7 +24,7 @@ FORMAT = 2
 POLICY = {"script", "args", "iteration", "policy"}  # what an exported policy has
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # codes of a terminal; a path may have other unprintable characters
 SHOWN = ("script", "iteration", "simulator")  # in messages, besides args
-PROVENANCE = "diffsim.extra.provenance"  # of the robot
+PROVENANCE = "diffsim.training.provenance"  # of the robot
 HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one
 
 # What a policy may consist of, where it is, and the attributes that its constructor takes.
@@ -32,15 +32,15 @@ LAYERS = {
     "ELU": ("torch.nn:ELU", ()),
     "First": ("diffsim.training.layers:First", ("columns",)),
     "LayerNorm": ("torch.nn:LayerNorm", ("normalized_shape",)),
-    "Likeliest": ("diffsim.extra.learning.likeliest:Likeliest", ("actions", "components", "shared")),
+    "Likeliest": ("diffsim.learning.likeliest:Likeliest", ("actions", "components", "shared")),
     "Linear": ("torch.nn:Linear", ("in_features", "out_features")),
-    "MirrorMean": ("diffsim.extra.symmetry:MirrorMean", ("size",)),
+    "MirrorMean": ("diffsim.symmetry.networks:MirrorMean", ("size",)),
     "ObsNormalizer": ("diffsim.training.layers:ObsNormalizer", ("size",)),
     "ReLU": ("torch.nn:ReLU", ()),
     "SiLU": ("torch.nn:SiLU", ()),
     "Softplus": ("torch.nn:Softplus", ()),
     "Tanh": ("torch.nn:Tanh", ()),
-    "WithMirrorImage": ("diffsim.extra.symmetry:WithMirrorImage", ("size",)),
+    "WithMirrorImage": ("diffsim.symmetry.networks:WithMirrorImage", ("size",)),
 }
 
 

@@ -25,7 +25,7 @@ from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
 
-GAIT = "diffsim.extra.gait:report"
+GAIT = "diffsim_cli.gait:report"
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit
 ENOUGH = 0.97  # share of the return that must survive

@@ -181,7 +181,7 @@ class Run:
         See graph.capture.
         """
         if self.args.compile:
-            function = pkgutil.resolve_name("diffsim.extra.fuse:fused")(function, self._learner, env)
+            function = pkgutil.resolve_name("diffsim.training.fuse:fused")(function, self._learner, env)
         call = graph.capture(function, self.device, env) if self.graphs and not eager else function
 
         def timed() -> Metrics:

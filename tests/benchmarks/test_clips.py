@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from worlds import OtherFile
 
 import diffsim
-from diffsim.extra.robots.imitation.clip import Clip, read_clip
-from diffsim.extra.robots.imitation.tracking import G1Track
 from diffsim.training import SavedPolicy
 from diffsim.training.checkpoint import POLICIES
+from diffsim_robots.imitation.clip import Clip, read_clip
+from diffsim_robots.imitation.tracking import G1Track
 
 
 class Nothing(nn.Module):

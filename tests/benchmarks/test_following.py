@@ -14,9 +14,9 @@ from common import parse
 from learners import refusal
 from tables import read_csv
 
-from diffsim.extra.terrain import uneven
 from diffsim.tasks import TASKS
 from diffsim.training.checkpoint import POLICIES
+from diffsim_robots.terrain import uneven
 
 BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 

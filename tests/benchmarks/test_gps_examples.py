@@ -13,7 +13,7 @@ from learners import ROOT, SMALL, refusal, run
 import diffsim
 import gps
 import shac
-from diffsim.extra.planning import System, load_demonstration
+from diffsim.planning import System, load_demonstration
 from diffsim.training import parse
 from diffsim.training.evaluation import make_env
 

@@ -10,18 +10,18 @@ import gps_variants
 import numpy as np
 import pytest
 import torch
-from extra.planning.systems import jacobian_errors
 from gps_variants import Ground, named_terrains
 from learners import assert_same, refusal, run
+from planning.systems import jacobian_errors
 from scenes import task_scene
 
 import diffsim
-from diffsim.extra import render
-from diffsim.extra.planning import save_demonstration
-from diffsim.extra.terrain import incline, rough
-from diffsim.extra.watch import film_median
+from diffsim.planning import save_demonstration
 from diffsim.sim.elevation import Elevation
 from diffsim.training import parse
+from diffsim_cli import render
+from diffsim_cli.watch import film_median
+from diffsim_robots.terrain import incline, rough
 
 SLOPES = "level", "incline:15:-1", "incline:-15:-1"  # all but the first begin behind the start
 SMALL = (

@@ -56,7 +56,7 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
         ("sac_large", 2),
     }
     (cell,) = (cell for cell in some if cell.learner == "sac_large")
-    command = "python sac_baseline.py --env humanoid --seed 2 --device cuda --large-batch --accuracy fast"
+    command = "python baselines/sac_baseline.py --env humanoid --seed 2 --device cuda --large-batch --accuracy fast"
     assert cell.command == f"{command} --iterations 400"
     other = paper.Args(only=("headline", "cores"), learners=("sapo",), env=("hopper",), seeds=(4,), machine="h100")
     assert [*paper.wanted(other)] == [one._replace(machine="h100"), one._replace(machine="cpu")]
@@ -150,7 +150,7 @@ def test_what_is_missing_is_said_with_its_command(known: list[dict[str, str]]) -
         "h200: python shac.py --env hopper --seed {1 2 3 4 5} --device cuda",
         "h200: python ppo_baseline.py --env hopper --seed {1 2 3 4 5} --device cuda "
         "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --iterations 1200",
-        "h200: python sapo.py --env hopper --seed {3} --device cuda",
+        "h200: python baselines/sapo.py --env hopper --seed {3} --device cuda",
     ]
     assert count == "16 of 20 cells are missing"
 

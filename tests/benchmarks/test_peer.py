@@ -14,8 +14,8 @@ from learners import refusal
 from tables import read_csv
 
 import diffsim
-from diffsim.extra.watch import make_policy_env
 from diffsim.training import load_policy
+from diffsim_cli.watch import make_policy_env
 
 pytest.importorskip("mujoco_warp")
 

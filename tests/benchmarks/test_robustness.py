@@ -18,13 +18,13 @@ from torch import Tensor
 
 import diffsim
 from diffsim import DiffEnv, Integration
-from diffsim.extra.robots.imitation.clip import Clip, read_clip
-from diffsim.extra.robots.imitation.task import HumanoidImitation
 from diffsim.tasks import Task
 from diffsim.training import SavedPolicy, checkpoint
 from diffsim.training.checkpoint import POLICIES
 from diffsim.training.evaluation import SEED
 from diffsim.training.layers import Chain
+from diffsim_robots.imitation.clip import Clip, read_clip
+from diffsim_robots.imitation.task import HumanoidImitation
 
 pytestmark = pytest.mark.unoptimized
 PUCK = """

@@ -9,9 +9,9 @@ import rollouts
 from common import RESULTS
 from tables import read_csv
 
-from diffsim.extra.report import approximations
 from diffsim.robot.mjcf import load_scene
 from diffsim.sim import simulator
+from diffsim_cli.report import approximations
 
 HANDFUL = 0, 1, 2, 3, 4, 6
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import mbpo
+import pfpn_sac
 import pytest
+import sac_baseline
+import sapo
 import stages
 import suites
 from common import RESULTS, ROOT
 from gps_variants import VariantArgs
 from tables import read_csv
 
-import mbpo
 import pfpn
-import pfpn_sac
 import ppo_baseline
 import rpo
-import sac_baseline
-import sapo
 import shac
 from diffsim.training import parse
 

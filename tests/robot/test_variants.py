@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scenes import free_states, parse, random_tree, robot
 
 from diffsim import Integration, Scene, SceneError, Simulator
-from diffsim.extra.report import approximations
 from diffsim.robot.constants import constrained
 from diffsim.sim import simulator
+from diffsim_cli.report import approximations
 
 pytestmark = pytest.mark.unoptimized
 States: TypeAlias = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # qpos and qvel

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
+import sapo
 import torch
 from torch import Tensor
 
 import bptt
 import ppo_baseline
 import rpo
-import sapo
 import shac
 from diffsim.env import DiffEnv
 from diffsim.training import Learner, Run, checkpoint, distributed

@@ -15,9 +15,9 @@ from torch import nn
 
 import diffsim
 import shac
-from diffsim.extra import commands
 from diffsim.training import load_policy, parse
 from diffsim.training.checkpoint import FORMAT, load, restore, save
+from diffsim_cli import commands
 
 STATE: dict[str, Any] = {
     "args": {"env": "cartpole"},

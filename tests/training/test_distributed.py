@@ -8,17 +8,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import mbpo
+import pfpn_sac
+import pods
 import pytest
 import ranks
+import sac_baseline
 import torch
 from learners import PATH, assert_same, refusal, run
 
 import gps
-import mbpo
 import pfpn
-import pfpn_sac
-import pods
-import sac_baseline
 import shac
 from diffsim.env import DiffEnv
 

@@ -15,9 +15,9 @@ from torch import nn
 
 import diffsim
 import shac
-from diffsim.extra import render
-from diffsim.extra.watch import film_median
 from diffsim.training import Evaluation, evaluate, evaluation
+from diffsim_cli import render
+from diffsim_cli.watch import film_median
 
 
 @pytest.fixture(scope="module")

@@ -1,1 +1,0 @@
-"""Tasks that are not of the SHAC paper."""

@@ -1,0 +1,1 @@
+"""The command `diffsim`: it demonstrates, drives, trains, films, checks, tunes and exports."""
