@@ -5,7 +5,7 @@ from typing import Any
 
 from diffsim.kernels.thread.division import Division
 from diffsim.robot.pairs import PairSizes
-from diffsim.robot.scene import Scene
+from diffsim.robot.scene import FACTORS, Scene
 
 FAR = 256.0  # m and rad, beyond which rounding a substep's motion to float32 matters
 MAX_POSITION = 1e5  # m and rad; beyond, float32 does not resolve a hundredth
@@ -85,6 +85,11 @@ class KernelSpec:
         """Tell whether damping follows the constraints."""
         *dampers, explicit = self.has("damping base_damping tendon_damping explicit_damping")
         return self.constrained and any(dampers) and not explicit
+
+    @property
+    def nconstants(self) -> int:
+        """Return the number of constants with gradients: factors of each environment, or parameters of the scene."""
+        return self.parameters or (len(FACTORS) if self.varied else 0)
 
     @property
     def nfactor(self) -> int:
