@@ -158,7 +158,7 @@ def ground_contact(spec: KernelSpec) -> SimpleNamespace:
     def trial_contacts(
         m: Model, here: Lane, begin: int, end: int, step: vec6, alpha: T, evaluation: int, contacts: t.Contacts
     ):
-        """Evaluate a link's contacts after the trial step alpha step; returns their part of newton.evaluate_trial."""
+        """Evaluate a link's contacts after the trial step alpha step; returns their part of evaluate_trial."""
         total = vec6()
         for s in range(begin, end):
             c = contacts[s].sphere
