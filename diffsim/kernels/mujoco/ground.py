@@ -13,6 +13,7 @@ import warp as wp
 from diffsim.kernels.laws.terrain import terrain_contact
 from diffsim.kernels.mujoco.cone import friction_cone
 from diffsim.kernels.mujoco.impedance import impedance_law
+from diffsim.kernels.thread.columns import CONTACT
 from diffsim.kernels.thread.lane import K_D, K_N, MU
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
@@ -221,7 +222,7 @@ def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
     in_frame, in_world, cone = terrain_contact(spec).in_frame, terrain_contact(spec).in_world, friction_cone(spec)
     (TERRAIN, PYRAMID), FRAMED, VARIED = spec.has("terrain pyramid"), spec.framed, spec.varied
     NV, ROOM = spec.nv, contact_room(spec)
-    LEARNED, COLUMNS = spec.parameters > 0, spec.parameters - 2 * (spec.spheres + spec.pairs)  # see parameters.py
+    LEARNED, COLUMNS = spec.parameters > 0, spec.columns.ground
 
     @wp.func
     def recorded_sphere(here: Lane, s: int, ck: t.Checkpoint):
@@ -272,8 +273,8 @@ def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
                 adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
             if wp.static(LEARNED):
                 by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                adj_factors[COLUMNS + 2 * c] = adj_factors[COLUMNS + 2 * c] - by_mu
-                adj_factors[COLUMNS + 2 * c + 1] = adj_factors[COLUMNS + 2 * c + 1] + wp.dot(f, w)
+                adj_factors[COLUMNS + CONTACT * c] = adj_factors[COLUMNS + CONTACT * c] - by_mu
+                adj_factors[COLUMNS + CONTACT * c + 1] = adj_factors[COLUMNS + CONTACT * c + 1] + wp.dot(f, w)
             if wp.static(FRAMED):  # adjoint of a rotation of the frame
                 g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
             if wp.static(PYRAMID):
