@@ -27,7 +27,8 @@ from diffsim.robot.constants import LEAST_FRICTION, LEAST_WEIGHT, constrained
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos
 from diffsim.robot.geoms import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Scene, SceneError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 

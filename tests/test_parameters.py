@@ -31,7 +31,8 @@ from torch import Tensor
 
 from diffsim.parameters import FIELDS, ParametricSimulator
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Scene, SceneError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import SceneError
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator

@@ -24,7 +24,8 @@ from diffsim.robot.elements import (
     servos,
 )
 from diffsim.robot.geoms import POINTS, declared_pairs, ground_pairs, pair_law
-from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
+from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
+from diffsim.robot.types import Array
 
 Joint = mujoco.mjtJoint
 # The kind of an element, a mask of those elements or their names, and what is not simulated of them
