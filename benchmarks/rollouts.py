@@ -20,7 +20,7 @@ import tyro
 from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import Simulator
-from diffsim.robot.geoms import contact_points
+from diffsim.robot.contacts import contact_points
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
 from diffsim.robot.types import Array

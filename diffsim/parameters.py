@@ -24,8 +24,8 @@ from torch import Tensor
 
 from diffsim.kernels.thread.columns import LINK, Columns
 from diffsim.robot.constants import LEAST_FRICTION, LEAST_WEIGHT, constrained
+from diffsim.robot.contacts import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos
-from diffsim.robot.geoms import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
 from diffsim.robot.types import SceneError

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from diffsim.robot.contacts import matrix_of
 from diffsim.robot.elements import motors, muscles, servos, takes_euler
-from diffsim.robot.geoms import matrix_of
 from diffsim.robot.types import Array, Transmissions
 
 Transmission, Ball = mujoco.mjtTrn, mujoco.mjtJoint.mjJNT_BALL

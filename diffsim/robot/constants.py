@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim.robot.contacts import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed, takes_euler
-from diffsim.robot.geoms import ground_pairs, pair_law
 from diffsim.robot.pairs import GEOMS, Pairs, rows_of
 from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
 from diffsim.robot.types import Array, SceneError
