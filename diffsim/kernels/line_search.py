@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.mujoco.ground import UNSOLVED, contact_room, ground_contact
+from diffsim.kernels.mujoco.impedance import impedance_law
 from diffsim.kernels.mujoco.limits import joint_limits
 from diffsim.kernels.pairs.rows import pair_rows
 from diffsim.kernels.thread.exchange import lane_sums
@@ -34,8 +35,8 @@ FULL_STEP_PASSES = 6, 2  # passes, and with dry friction, that accept a whole st
 def step_length(spec: KernelSpec) -> SimpleNamespace:
     """Make the line search, `line_search`."""
     t, sums, block = types(spec), lane_sums(spec), blocks(spec)
-    ground, limits = ground_contact(spec), joint_limits(spec)
-    T, vec4, vec6, Model, Lane, pick = t.T, t.vec4, t.vec6, t.Model, t.Lane, block.pick
+    ground, limits, add_trials = ground_contact(spec), joint_limits(spec), impedance_law(spec).add_trials
+    T, vec4, Model, Lane, pick = t.T, t.vec4, t.Model, t.Lane, block.pick
     Links, Motions, Loads, Newton = t.Links, t.Motions, t.Loads, t.Newton
     CONTACT, LIMIT, LOSS = spec.has("contact limit frictionloss")
     JOINT_ROWS, SHARED, FULL_STEPS = LIMIT or LOSS, spec.threads_per_env > 1, FULL_STEP_PASSES[LOSS]
@@ -48,12 +49,8 @@ def step_length(spec: KernelSpec) -> SimpleNamespace:
     def evaluate_trial(
         m: Model, here: Lane, links: Links, motions: Motions, contacts: t.Contacts, alpha: T, evaluation: int
     ):
-        """Evaluate the constraints after the trial step alpha s; alpha is 1 in evaluation 0.
-
-        Returns (s.(f - alpha H s - f(alpha s)), s.H s, s.H(alpha s) s, the square of that difference of forces as an
-        acceleration, the ratio of contact stiffness to inertia, 0).
-        """
-        total = vec6()
+        """Evaluate the constraints after the trial step alpha s; alpha is 1 in evaluation 0."""
+        total = t.Trial()
         for i in range(here.n):
             k = here.at + i
             if wp.static(JOINT_ROWS):
@@ -65,29 +62,28 @@ def step_length(spec: KernelSpec) -> SimpleNamespace:
                     force_error = motions[i].con_force - alpha * linear - trial[0]
                     w = T(m.limit_params[k][4])
                     accel_error = w * force_error / (T(1.0) + w * trial[1])
-                    total = total + T(m.owned[k]) * vec6(
-                        step * force_error,
-                        step * linear,
-                        step * trial[1] * step,
-                        accel_error * accel_error,
-                        T(0.0),
-                        T(0.0),
-                    )
+                    owned = T(m.owned[k])
+                    total.slope = total.slope + owned * (step * force_error)
+                    total.linear = total.linear + owned * (step * linear)
+                    total.curvature = total.curvature + owned * (step * trial[1] * step)
+                    total.error_sq = total.error_sq + owned * (accel_error * accel_error)
                     motions[i].trial_force = trial[0]
                     motions[i].trial_slope = trial[1]
             if wp.static(CONTACT):
                 if i >= FIRST:
                     begin, end = motions[i].contacts_begin, motions[i].contacts_end
-                    total = total + ground.trial_contacts(
-                        m, here, begin, end, motions[i].A, alpha, evaluation, contacts
-                    )
+                    touching = ground.trial_contacts(m, here, begin, end, motions[i].A, alpha, evaluation, contacts)
+                    total = add_trials(total, touching)
         if wp.static(FULL):
-            total[3] = total[3] + T(wp.where(here.contacts > ROOM, UNSOLVED, 0.0))
+            total.error_sq = total.error_sq + T(wp.where(here.contacts > ROOM, UNSOLVED, 0.0))
         if wp.static(PAIRS):
-            total = total + pairs.trial(m, here, motions, alpha, contacts)
+            total = add_trials(total, pairs.trial(m, here, motions, alpha, contacts))
         if wp.static(SHARED):
-            for r in range(5):
-                total[r] = sums.add(total[r])
+            total.slope = sums.add(total.slope)
+            total.linear = sums.add(total.linear)
+            total.curvature = sums.add(total.curvature)
+            total.error_sq = sums.add(total.error_sq)
+            total.stiffness = sums.add(total.stiffness)
         return total
 
     @wp.func
@@ -159,20 +155,20 @@ def step_length(spec: KernelSpec) -> SimpleNamespace:
         evaluation = int(0)
         while evaluation <= MAX_EVALUATIONS:
             total = evaluate_trial(m, here, links, motions, contacts, alpha, evaluation)
-            rounding = T(ROUNDING) * total[4]
+            rounding = T(ROUNDING) * total.stiffness
             remaining_sq = (T(1.0) - alpha) * (T(1.0) - alpha) + rounding * rounding
-            residual_sq = (T(COUPLING * COUPLING) * total[3] + remaining_sq * step_sq) / status.accel_sq
+            residual_sq = (T(COUPLING * COUPLING) * total.error_sq + remaining_sq * step_sq) / status.accel_sq
             status.residual_sq = pick(T(0.0), status.active, residual_sq, status.residual_sq)
             if evaluation == 0 and status.passes > 0:
-                rise = status.active * (total[0] - slope_tolerance * total[1])
+                rise = status.active * (total.slope - slope_tolerance * total.linear)
                 overshoots = pick(tolerance_sq, residual_sq, rise, T(0.0))
                 if block.any_of(overshoots):
-                    first = inertia_along(m, here, motions, free_loads) + total[1]
+                    first = inertia_along(m, here, motions, free_loads) + total.linear
                     bracket[1] = -first
             last = alpha
             if evaluation < MAX_EVALUATIONS and block.any_of(overshoots):
-                slope = total[0] - (T(1.0) - alpha) * first
-                curvature = first - total[1] + total[2]
+                slope = total.slope - (T(1.0) - alpha) * first
+                curvature = first - total.linear + total.curvature
                 following, bracket = next_trial(alpha, bracket, first, slope, curvature, slope_tolerance, evaluation)
                 alpha = pick(T(0.0), overshoots, following, alpha)
             evaluation = wp.where(block.any_of(wp.abs(alpha - last)), evaluation + 1, MAX_EVALUATIONS + 1)

@@ -159,8 +159,8 @@ def ground_contact(spec: KernelSpec) -> SimpleNamespace:
     def trial_contacts(
         m: Model, here: Lane, begin: int, end: int, step: vec6, alpha: T, evaluation: int, contacts: t.Contacts
     ):
-        """Evaluate a link's contacts after the trial step alpha step; returns their part of evaluate_trial."""
-        total = vec6()
+        """Evaluate a link's contacts after the trial step alpha step; returns their Trial."""
+        total = t.Trial()
         for s in range(begin, end):
             c = contacts[s].sphere
             step_jar = point_velocity(step, contacts[s].p)
@@ -174,14 +174,11 @@ def ground_contact(spec: KernelSpec) -> SimpleNamespace:
             force_error = contacts[s].f - alpha * contacts[s].Hs - f
             w = T(m.contact_params[c][4])
             accel_error = impedance.acceleration_for(force_error, w, H)
-            total = total + vec6(
-                wp.dot(step_jar, force_error),
-                wp.dot(step_jar, contacts[s].Hs),
-                wp.dot(step_jar, H * step_jar),
-                wp.dot(accel_error, accel_error),
-                w * wp.trace(H),
-                T(0.0),
-            )
+            total.slope = total.slope + wp.dot(step_jar, force_error)
+            total.linear = total.linear + wp.dot(step_jar, contacts[s].Hs)
+            total.curvature = total.curvature + wp.dot(step_jar, H * step_jar)
+            total.error_sq = total.error_sq + wp.dot(accel_error, accel_error)
+            total.stiffness = total.stiffness + w * wp.trace(H)
             contacts[s].trial_jar = jar
             contacts[s].trial_force = f
             contacts[s].H = H
