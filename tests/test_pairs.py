@@ -17,10 +17,11 @@ from test_constraint import CONES, STATES, H, check_gradients, check_neighbours,
 from test_gradient import gradients, weights
 
 from diffsim.robot import pairs as robot_pairs
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.robot.pairs import with_pairs
-from diffsim.robot.scene import FACTORS, SceneError
+from diffsim.robot.scene import FACTORS
 from diffsim.robot.shapes import as_primitives
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim_cli.report import approximations, report

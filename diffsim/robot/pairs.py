@@ -10,10 +10,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
+from diffsim.robot.contacts import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
-from diffsim.robot.scene import Array, Index, Scene, SceneError
+from diffsim.robot.scene import Scene
 from diffsim.robot.shapes import as_primitives, is_exact, obstacle_geoms
+from diffsim.robot.types import Array, Index, SceneError
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
 Touch = Callable[[int, int], Array]  # two geoms

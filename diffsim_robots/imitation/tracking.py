@@ -14,7 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 from diffsim.symmetry.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
 from diffsim.tasks.base import Contact, Defaults, TaskError
 from diffsim.tasks.locomotion import rotate

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.mujoco.constraint import pair_column
+from diffsim.kernels.mujoco.ground import pair_column
 from diffsim.kernels.pairs.equality_adjoint import equality_adjoint
 from diffsim.kernels.pairs.geoms import pair_geoms
 from diffsim.kernels.pairs.jacobian import pair_jacobian
@@ -42,7 +42,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
     SOLVES, VARIED, LEARNED = spec.solves, spec.varied, spec.parameters > 0
     COLUMN = pair_column(spec)  # of jar in the checkpoint
-    COLUMNS = spec.parameters - 2 * spec.pairs  # see parameters.py
+    COLUMNS = spec.columns.pairs
     TOUCH = "geoms_rows" in spec.features
     geoms, touch = (pair_geoms(spec, True), touch_adjoint(spec)) if TOUCH else (None, None)
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]

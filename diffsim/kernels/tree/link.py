@@ -15,13 +15,16 @@ from diffsim.kernels.thread.spec import KernelSpec
 
 @cache
 def link_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make a link's part of the equations of motion, and its adjoint."""
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, mat3, Model, Lane, Link = t.T, t.vec3, t.mat3, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
     momentum, CarrierPos, Load, VARIED = sp.momentum, t.CarrierPos, t.Load, spec.varied
-    # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
+    # With MuJoCo's constraints contacts are added in each pass of the solve: mujoco/ground.py.
     GRAVCOMP, DRAG, CONTACT = spec.has("gravcomp drag contact")
     CONTACT = CONTACT and not spec.constrained
+    NBALL, INERT = spec.nball, spec.inert
+    FIRST = 0 if spec.floating else 1 + INERT  # the first link with inertia
 
     @wp.func
     def world_inertia(m: Model, k: int, link: Link):
@@ -59,6 +62,19 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(CONTACT):
             load = contact.add_contacts(m, here, k, link, carrier, load)
         return load
+
+    @wp.func
+    def outward(m: Model, here: Lane, carrier: t.CarrierPos, links: t.Links, motions: t.Motions, loads: t.Loads):
+        """Compute the links' velocity products, inertias and bias forces from their kinematics."""
+        for i in range(1, here.n):
+            turning = i
+            if wp.static(NBALL > 0):
+                turning = m.inboard[here.at + i]
+            motions[i].C = wp.spatial_cross(links[turning].V, links[i].S * links[i].qd)
+        for i in range(1, INERT + 1):
+            loads[i] = Load()
+        for i in range(FIRST, here.n):
+            loads[i] = link_inertia(m, here, here.at + i, links[i], carrier)
 
     @wp.func
     def link_adjoint(m: Model, here: Lane, k: int, link: Link, node: Node, carrier: CarrierPos, adj_factors: Array):
@@ -108,6 +124,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_adjoints(x: Adjoint, y: Adjoint):
+        """Return the sum of two adjoints."""
         x.a = x.a + y.a
         x.v = x.v + y.v
         x.w = x.w + y.w
