@@ -23,8 +23,8 @@ import tyro
 from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import SceneError, Simulator, load_scene
-from diffsim.robot.contact import ground_pairs
 from diffsim.robot.elements import control_range
+from diffsim.robot.geoms import ground_pairs
 from diffsim.robot.pairs import as_primitives, touching
 from diffsim.robot.scene import Array, Scene
 from diffsim.sim.integration import Integration

@@ -20,7 +20,7 @@ import tyro
 from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import Simulator
-from diffsim.robot.contact import contact_points
+from diffsim.robot.geoms import contact_points
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Array, Scene
 from diffsim.sim import simulator

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim.kernels import parameters as columns
-from diffsim.robot.constraint import LEAST_FRICTION, LEAST_WEIGHT, constrained
-from diffsim.robot.contact import declared_pairs, ground_pairs, pair_law
+from diffsim.robot.constants import LEAST_FRICTION, LEAST_WEIGHT, constrained
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos
+from diffsim.robot.geoms import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from diffsim.robot.contact import (
+from diffsim.robot.elements import control_range, label, listed, motors, muscles
+from diffsim.robot.geoms import (
     HULL_POINTS,
     base_geoms,
     contact_points,
@@ -16,7 +17,6 @@ from diffsim.robot.contact import (
     matrix_of,
     pair_law,
 )
-from diffsim.robot.elements import control_range, label, listed, motors, muscles
 from diffsim.robot.pairs import as_primitives, deviation, directions, is_exact, obstacle_geoms, reach, self_pairs
 from diffsim.robot.scene import Scene
 from diffsim.tasks.own_task import start_control

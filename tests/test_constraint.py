@@ -33,7 +33,7 @@ from test_gradient import differences, gradients, weights
 from test_terrain import HILLS, everywhere, hopping, pressed
 
 import diffsim
-from diffsim.kernels.mujoco import constraint
+from diffsim.kernels.mujoco import ground
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim import simulator
@@ -644,8 +644,8 @@ def test_steps_that_do_not_converge_are_counted(monkeypatch):
 
 def test_steps_that_have_no_room_for_a_contact_are_counted(monkeypatch):
     """And no others: those are MuJoCo's."""
-    monkeypatch.setattr(constraint, "MOST_CONTACTS", 4)
-    monkeypatch.setattr(constraint, "SHARES", (4, 4))
+    monkeypatch.setattr(ground, "MOST_CONTACTS", 4)
+    monkeypatch.setattr(ground, "SHARES", (4, 4))
     feet = "".join(f'<geom type="sphere" size=".05" pos="{0.1 * k} {0.1 * (k % 2)} 0"/>' for k in range(6))
     scene = parse(robot(f'<body name="comb"> <freejoint/> {feet} </body>'))
     turns = np.linspace(-0.031, 0.031, 13)

@@ -21,7 +21,7 @@ from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.thread.division import divide
 from diffsim.kernels.thread.spec import kernel_spec
 from diffsim.kernels.thread.wide import module_options
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS
 from diffsim.sim import simulator

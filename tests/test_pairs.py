@@ -16,7 +16,7 @@ from scenes import free_states, parse, pendulum, random_tree, robot
 from test_constraint import CONES, STATES, H, check_gradients, in_mujoco, mujoco_model, step
 
 from diffsim.robot import pairs as robot_pairs
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.robot.pairs import as_primitives, with_pairs
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim.integration import Integration

@@ -13,8 +13,8 @@ from scenes import BALL, PENDULUM, acting_states, parse, run, task_scene, unit
 from test_gradient import check_gradients
 
 import diffsim
+from diffsim.robot.profile import TerrainError
 from diffsim.robot.scene import FACTORS, Scene
-from diffsim.robot.terrain import TerrainError
 from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator

@@ -23,7 +23,8 @@ import warp as wp
 from diffsim.kernels.laws.force import external_force
 from diffsim.kernels.laws.joint import joint_law
 from diffsim.kernels.laws.muscle import muscle_law
-from diffsim.kernels.mujoco.constraint import constraint_law
+from diffsim.kernels.mujoco.ground import ground_adjoint
+from diffsim.kernels.mujoco.limits import joint_limits
 from diffsim.kernels.pairs.adjoint import pair_adjoint
 from diffsim.kernels.parameters import parameter_adjoint
 from diffsim.kernels.thread.exchange import lane_sums
@@ -47,7 +48,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.Ts
     lane, join, load, link_of, qpos_adr = lane_of(spec), sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
-    muscle, constraint, parameters = muscle_law(spec), constraint_law(spec), parameter_adjoint(spec)
+    muscle, parameters = muscle_law(spec), parameter_adjoint(spec)
+    ground, limits = ground_adjoint(spec), joint_limits(spec)
     PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_adjoint(spec) if spec.pairs else None
     CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
     CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT, BASE_DAMPED = spec.has("contact motor clamp muscle limit base_damping")
@@ -188,9 +190,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             k = here.at + i
             own = link.link_adjoint(m, here, k, links[i], nodes[i], carrier, adj_factors)
             if wp.static(CONSTRAINED and CONTACT):
-                own, s = constraint.add_contacts_adjoint(
-                    m, here, k, s, links[i], nodes[i], carrier, ck, own, adj_factors
-                )
+                own, s = ground.add_contacts_adjoint(m, here, k, s, links[i], nodes[i], carrier, ck, own, adj_factors)
             if wp.static(DAMPED):
                 own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own, adj_factors)
             adj[i] = own
@@ -211,7 +211,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * by[0]  # of one lane with the joint
             adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - T(m.owned[k]) * own.lam * by[1]
         if wp.static(CONSTRAINED):
-            con_derivatives = constraint.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
+            con_derivatives = limits.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
             derivatives = derivatives + vec2(con_derivatives[0], con_derivatives[1])
             if wp.static(VARIED):
                 adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * con_derivatives[2]

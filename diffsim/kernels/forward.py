@@ -1,6 +1,6 @@
 """One control step: all substeps of all environments in one launch.
 
-On a GPU one thread or several simulate an environment (lanes.py). On a CPU one thread simulates a block (wide.py).
+On a GPU one thread or several simulate an environment (division.py). On a CPU one thread simulates a block (wide.py).
 
 A substep is Featherstone's articulated-body algorithm (RBDA, Table 7.1) about the carrier's current position in world
 axes, then semi-implicit Euler with the exact quaternion exponential. Its factorisation (U and 1/d of each joint, the
@@ -14,7 +14,7 @@ import warp as wp
 from diffsim.kernels.laws.force import external_force
 from diffsim.kernels.laws.joint import joint_law
 from diffsim.kernels.laws.muscle import muscle_law
-from diffsim.kernels.mujoco.constraint import constraint_law, contact_room
+from diffsim.kernels.mujoco.ground import contact_room, ground_contact
 from diffsim.kernels.newton import newton_method
 from diffsim.kernels.pairs.rows import pair_rows
 from diffsim.kernels.thread.exchange import lane_sums
@@ -40,7 +40,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
-    muscle, sweep, constraint, newton = muscle_law(spec), articulated(spec), constraint_law(spec), newton_method(spec)
+    muscle, sweep, ground, newton = muscle_law(spec), articulated(spec), ground_contact(spec), newton_method(spec)
     PAIRS, BLOCKS, pairs = spec.pairs > 0, spec.pair_sizes.blocks, pair_rows(spec) if spec.pairs else None
     CONTACT, MOTOR, MUSCLE, TENDON, SITE, CHAIN = spec.has("contact motor muscle tendon site tendon_chain")
     transmission = transmission_law(spec) if TENDON or SITE else None
@@ -288,7 +288,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 root.wdot = vec3()
                 root.vdot = vec3()
                 if wp.static(CONTACT):
-                    here.contacts = constraint.begin_contacts(m, here, links, carrier, motions, contacts)
+                    here.contacts = ground.begin_contacts(m, here, links, carrier, motions, contacts)
                 newton.initialize(m, here, links, motions, loads, free_loads, root)
                 if wp.static(PAIRS):
                     here.begin = int(GROUND)
@@ -335,7 +335,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if record == 1:  # the acceleration before damping, at which the adjoint differentiates the constraints
                     record_accelerations(m, here, ck, NV, root.newton_vdot, root.newton_wdot, motions)
                     if wp.static(CONTACT):
-                        constraint.record_contacts(here, ck, contacts)
+                        ground.record_contacts(here, ck, contacts)
                     if wp.static(PAIRS):
                         pairs.record(here, ck, contacts)
                 for i in range(1, here.n):

@@ -17,7 +17,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.laws.joint import joint_law
-from diffsim.kernels.mujoco.constraint import UNSOLVED, constraint_law, contact_room
+from diffsim.kernels.mujoco.ground import UNSOLVED, contact_room, ground_contact
+from diffsim.kernels.mujoco.limits import joint_limits
 from diffsim.kernels.pairs.rows import pair_rows
 from diffsim.kernels.thread.exchange import lane_sums
 from diffsim.kernels.thread.model import functions, types
@@ -36,7 +37,8 @@ FULL_STEP_PASSES = 6, 2  # passes, and with dry friction, that accept a whole st
 
 @cache
 def newton_method(spec: KernelSpec) -> SimpleNamespace:
-    t, sums, block, constraint = types(spec), lane_sums(spec), blocks(spec), constraint_law(spec)
+    t, sums, block = types(spec), lane_sums(spec), blocks(spec)
+    ground, limits = ground_contact(spec), joint_limits(spec)
     T, vec3, vec4, vec6, Model, Lane, pick = t.T, t.vec3, t.vec4, t.vec6, t.Model, t.Lane, block.pick
     Links, Motions, Loads, Root, Newton = t.Links, t.Motions, t.Loads, t.Root, t.Newton
     joint, join, FLOATING = joint_law(spec), spatial(spec).join, spec.floating
@@ -61,9 +63,9 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                 motions[i].accel_link = motions[m.parent[k]].accel_link + motions[i].C
                 motions[i].free_force = joint.force(m, here, k, motions[i].motor, q, qd)
                 if wp.static(LIMIT):
-                    motions[i].limit = constraint.limit_state(m, here, k, q, qd)
+                    motions[i].limit = limits.limit_state(m, here, k, q, qd)
                 if wp.static(JOINT_ROWS):
-                    con = constraint.joint_constraint(m, k, motions[i].limit, qd, T(0.0), T(1.0))
+                    con = limits.joint_constraint(m, k, motions[i].limit, qd, T(0.0), T(1.0))
                     motions[i].con_force = con[0]
                     motions[i].con_slope = con[1]
 
@@ -77,7 +79,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             load.f = load.f + join(load.a * a + load.b * l, a * load.b + load.d * l)
             if wp.static(CONTACT):
                 if i >= FIRST:
-                    load = constraint.add_contacts(motions[i].contacts_begin, motions[i].contacts_end, contacts, load)
+                    load = ground.add_contacts(motions[i].contacts_begin, motions[i].contacts_end, contacts, load)
             loads[i] = load
         if wp.static(PAIRS):
             pairs.add_forces(m, here, contacts, motions, loads)
@@ -99,7 +101,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                     step = motions[i].u
                     linear = motions[i].con_slope * step
                     accel = motions[i].accel_joint + alpha * step
-                    trial = constraint.joint_constraint(m, k, motions[i].limit, links[i].qd, accel, T(0.0))
+                    trial = limits.joint_constraint(m, k, motions[i].limit, links[i].qd, accel, T(0.0))
                     force_error = motions[i].con_force - alpha * linear - trial[0]
                     w = T(m.limit_params[k][4])
                     accel_error = w * force_error / (T(1.0) + w * trial[1])
@@ -116,7 +118,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             if wp.static(CONTACT):
                 if i >= FIRST:
                     begin, end = motions[i].contacts_begin, motions[i].contacts_end
-                    total = total + constraint.trial_contacts(
+                    total = total + ground.trial_contacts(
                         m, here, begin, end, motions[i].A, alpha, evaluation, contacts
                     )
         if wp.static(FULL):
@@ -265,9 +267,9 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             motions[i].con_force = motions[i].trial_force
             motions[i].con_slope = motions[i].trial_slope
         if wp.static(CONTACT):
-            constraint.accept_contacts(0, wp.min(here.contacts, ROOM), contacts)
+            ground.accept_contacts(0, wp.min(here.contacts, ROOM), contacts)
         if wp.static(PAIRS):
-            constraint.accept_contacts(here.begin, here.end, contacts)
+            ground.accept_contacts(here.begin, here.end, contacts)
         status.passes = status.passes + 1
         return root, status
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.laws.joint import joint_law
-from diffsim.kernels.mujoco.constraint import constraint_law
+from diffsim.kernels.mujoco.limits import joint_limits
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -34,7 +34,7 @@ def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
     t, sp, kin, joint, block = types(spec), spatial(spec), kinematics(spec), joint_law(spec), blocks(spec)
     T, vec3, vec6, mat3, Model, Lane, Ck, Array = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Lane, t.Checkpoint, t.Ts
     Link, Node, pick, load = t.Link, t.Node, block.pick, kin.load
-    constraint = constraint_law(spec) if spec.constrained else None
+    limits = joint_limits(spec) if spec.constrained else None
     LIMIT, FRICTIONLOSS, CLAMP, MOTORS, EXPLICIT_SERVOS = spec.has("limit frictionloss clamp motor explicit_servos")
     LIMIT, CONSTRAINED, DAMPED, IMPLICIT = LIMIT and spec.constrained, spec.constrained, spec.damped, spec.implicit
     FIRST, VADR, NV, NU = 0 if spec.floating else 1, spec.dof0 - 1, spec.nv, spec.nu
@@ -88,7 +88,7 @@ def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
         add(columns, k + STIFFNESS, unclamped * lam * link.q)
         add(columns, k + SERVO_DAMPING, servo)
         if wp.static(LIMIT):
-            limit = constraint.limit_state(m, here, i, link.q, link.qd)
+            limit = limits.limit_state(m, here, i, link.q, link.qd)
             jar = limit[2] * qdd + limit[1]
             add(columns, k + WEIGHT, -lam * limit[2] * pick(jar, T(0.0), limit[0], T(0.0)) * jar)
         if wp.static(FRICTIONLOSS):
@@ -100,7 +100,7 @@ def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_parameters(m: Model, here: Lane, ck: Ck, links: t.Links, nodes: t.Nodes, ctrl: t.array2, columns: Array):
-        """Add the derivatives of phi, without those of contacts: constraint.add_contacts_adjoint has these."""
+        """Add the derivatives of phi, without those of contacts: ground.add_contacts_adjoint has these."""
         for i in range(FIRST, here.n):
             add_product(columns, LINK * i, links[i], nodes[i].W, nodes[i].A)
             add_product(columns, LINK * i, links[i], wp.spatial_cross(nodes[i].W, links[i].V), links[i].V)

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import matrix_of
 from diffsim.robot.elements import motors, muscles, servos
+from diffsim.robot.geoms import matrix_of
 from diffsim.robot.scene import Array, Index, takes_euler
 
 Transmission, Ball = mujoco.mjtTrn, mujoco.mjtJoint.mjJNT_BALL

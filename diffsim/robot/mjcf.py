@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.actuator import force_bounds, gear_of, on_joint, servo_sums, transmissions_of
-from diffsim.robot.contact import contact_points, ground_pairs, matrix_of
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, muscles, numeric, servos
+from diffsim.robot.geoms import contact_points, ground_pairs, matrix_of
 from diffsim.robot.pairs import with_obstacles, with_pairs
 from diffsim.robot.refuse import beyond, obstacles, strays
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres

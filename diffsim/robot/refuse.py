@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim.robot.actuator import Mask, at_site, driven, on_joint, on_tendon, refused, turning
-from diffsim.robot.contact import POINTS, declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import (
     at_rest,
     disabled_flags,
@@ -24,6 +23,7 @@ from diffsim.robot.elements import (
     numeric,
     servos,
 )
+from diffsim.robot.geoms import POINTS, declared_pairs, ground_pairs, pair_law
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
 
 Joint = mujoco.mjtJoint

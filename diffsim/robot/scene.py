@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.terrain import TerrainError, check_terrain
+from diffsim.robot.profile import TerrainError, check_terrain
 
 if TYPE_CHECKING:
     from diffsim.robot.actuator import Transmissions
-    from diffsim.robot.constraint import Constraints
+    from diffsim.robot.constants import Constraints
     from diffsim.robot.pairs import Pairs
 
 Array = NDArray[np.float64]
@@ -133,7 +133,7 @@ class Scene:
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
     geom_pairs: tuple[tuple[int, int], ...] = ()  # of the robot's geoms that may touch each other, see robot/pairs.py
-    constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
+    constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constants.py
     transmissions: Transmissions | None = None  # actuators on fixed tendons and at sites, whose motor_link is 0
     parameters: int = 0  # number of constants whose gradients the backward kernel computes, see diffsim/parameters.py
 

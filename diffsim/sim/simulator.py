@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch.autograd.forward_ad import unpack_dual
 
-from diffsim.robot.constraint import IMPEDANCE, check_soft, constrained
+from diffsim.robot.constants import IMPEDANCE, check_soft, constrained
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory

@@ -7,7 +7,7 @@ import pytest
 from scenes import CRANE, DISTINCT, ROBOTS, parse, pendulum, task_scene, without
 
 import diffsim
-from diffsim.robot.constraint import check_soft, constrained
+from diffsim.robot.constants import check_soft, constrained
 from diffsim.robot.scene import PENALTY_CONSTANTS, Scene, SceneError
 
 

@@ -12,7 +12,7 @@ by both. So d and n are continuous, d's gradient is n, and dn = k t (t . dc) wit
 two features are equally near: for a centre that is itself below a ridge, which is a depth of r or more, and in a notch
 that the sphere does not fit into.
 
-The law of contact, be it contact.py's or constraint.py's, acts in the frame E = (t, y, n) of the feature. Its adjoint
+The law of contact, be it soft_contact.py's or MuJoCo's, acts in the frame E = (t, y, n) of the feature. Its adjoint
 includes the rotation of that frame.
 """
 

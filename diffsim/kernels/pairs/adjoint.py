@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.mujoco.constraint import pair_column
+from diffsim.kernels.mujoco.ground import pair_column
 from diffsim.kernels.pairs.geometry import pair_geometry
 from diffsim.kernels.pairs.listing import pair_list
 from diffsim.kernels.pairs.rows import pair_rows

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.mujoco.constraint import UNSOLVED
+from diffsim.kernels.mujoco.ground import UNSOLVED
 from diffsim.kernels.pairs.boxes import box_contacts
 from diffsim.kernels.pairs.capsules import capsule_contacts
 from diffsim.kernels.pairs.geometry import pair_geometry

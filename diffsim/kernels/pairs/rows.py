@@ -15,7 +15,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.mujoco.constraint import constraint_law, pair_column
+from diffsim.kernels.mujoco.ground import pair_column
+from diffsim.kernels.mujoco.impedance import impedance_law
 from diffsim.kernels.pairs.geometry import pair_geometry
 from diffsim.kernels.pairs.listing import pair_list
 from diffsim.kernels.pairs.solver import row_solver
@@ -33,7 +34,7 @@ ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterat
 def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     """Make the rows' part of Newton's method."""
     t, block, kin, geometry = types(spec), blocks(spec), kinematics(spec), pair_geometry(spec)
-    solver, sp, constraint = row_solver(spec, "Motions"), spatial(spec), constraint_law(spec)
+    solver, sp, constraint = row_solver(spec, "Motions"), spatial(spec), impedance_law(spec)
     T, vec3, vec4, vec6, pick, join = t.T, t.vec3, t.vec4, t.vec6, block.pick, sp.join
     Model, Lane, Ck, Links, Contacts, Motions, Loads, Root, Newton = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Motions Loads Root Newton".split()

@@ -1,4 +1,4 @@
-"""Sum over the lanes that share an environment (lanes.py); all of them must call these functions together.
+"""Sum over the lanes that share an environment (division.py); all of them must call these functions together.
 
 A butterfly adds the same numbers in the same tree on every lane. So values that lanes have in common stay equal bit for
 bit.

@@ -13,7 +13,7 @@ PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     for name, kind in (
         ("row_kind", "ints"),  # of each block
         ("row_partner", "ints"),  # the block that shares its violation, or itself
-        ("row_params", "vec11s"),  # as rows of robot.constraint.Constraints
+        ("row_params", "vec11s"),  # as rows of robot.constants.Constraints
         ("row_shape", "vec11s"),  # numbers of a joint's polynomial, of a weld or of two geoms
         ("row_first", "vec3s"),  # m, the point on the first link, in its frame
         ("row_second", "vec3s"),  # m, on the second one
@@ -101,7 +101,7 @@ def add_constraints(
         structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
     if spec.constrained:
         structs["Node"] |= {
-            "B": vec6,  # sum of S qacc, the twist that gives J a (constraint.py)
+            "B": vec6,  # sum of S qacc, the twist that gives J a (mujoco/impedance.py)
             "qacc": T,  # the joint's acceleration before damping
         }
         structs["Adjoint"] |= {"b": vec6}  # B
@@ -109,7 +109,7 @@ def add_constraints(
             "accel_link": vec6,  # acceleration of the link, of Newton's iterate
             "contacts_begin": int,  # of the link's contacts in their list
             "contacts_end": int,
-            "limit": vec3,  # the limit's row, see constraint.limit_state
+            "limit": vec3,  # the limit's row, see limits.limit_state
             "accel_joint": T,  # acceleration of the joint, of Newton's iterate
             "free_force": T,  # force of the joint without constraints
             "con_force": T,  # force of its constraints

@@ -19,7 +19,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, mat3, Model, Lane, Link = t.T, t.vec3, t.mat3, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
     momentum, CarrierPos, Load, VARIED = sp.momentum, t.CarrierPos, t.Load, spec.varied
-    # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
+    # With MuJoCo's constraints contacts are added in each pass of the solve: mujoco/ground.py.
     GRAVCOMP, DRAG, CONTACT = spec.has("gravcomp drag contact")
     CONTACT = CONTACT and not spec.constrained
 

@@ -1,7 +1,7 @@
 """MuJoCo's constraints of a robot, from its file's solref, solimp, friction, margin and frictionloss.
 
 Nothing here is fitted. MuJoCo's documentation, "Computation", defines the law;
-kernels/mujoco/constraint.py has the equations.
+kernels/mujoco/impedance.py has the equations.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim.robot.contact import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
+from diffsim.robot.geoms import ground_pairs, pair_law
 from diffsim.robot.pairs import GEOMS, Pairs, rows_of
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene, SceneError, takes_euler
 
