@@ -69,8 +69,8 @@ DISTURBANCES = [  # what of an environment gets which value
 
 def four_steps(sim, given):
     """States, gradients and what was contained of four steps and their backward pass, a row for each environment."""
-    inputs = {name: x.clone().requires_grad_() for name, x in given.items()}
-    sim.factors, sim.forces = inputs["factors"], inputs["forces"]
+    inputs = {name: x.clone().requires_grad_() for name, x in given.items() if name != "factors"}
+    sim.factors, sim.forces = given["factors"], inputs["forces"]
     state, states, lost = (inputs["qpos"], inputs["qvel"]), [], []
     sim.nonfinite_gradients.zero_()
     sim.rewind()

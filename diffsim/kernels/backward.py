@@ -28,7 +28,7 @@ from diffsim.kernels.mujoco.limits import joint_limits
 from diffsim.kernels.pairs.adjoint import pair_adjoint
 from diffsim.kernels.parameters import parameter_adjoint
 from diffsim.kernels.thread.exchange import lane_sums
-from diffsim.kernels.thread.lane import D_LIMIT, K_LIMIT, MOTOR, lane_of
+from diffsim.kernels.thread.lane import lane_of
 from diffsim.kernels.thread.model import types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -37,13 +37,12 @@ from diffsim.kernels.transmission import transmission_law
 from diffsim.kernels.tree.kinematics import kinematics
 from diffsim.kernels.tree.link import link_law
 from diffsim.kernels.tree.solve import factor_solve
-from diffsim.robot.scene import FACTORS
 
 
 @cache
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
-    T, vec2, vec3, vec6, quat, Model, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Lane
+    T, vec3, vec6, quat, Model, Lane = t.T, t.vec3, t.vec6, t.quat, t.Model, t.Lane
     Link, Node, Adjoint, Base, Contact = t.Link, t.Node, t.Adjoint, t.Base, t.Contact
     Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.Ts
     lane, join, load, link_of, qpos_adr = lane_of(spec), sp.join, kin.load, kin.link_of, kin.qpos_adr
@@ -63,7 +62,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in spec.features
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.room
     # Local arrays have at least one element, also where they are not read.
-    NFACTORS, LEARNED = spec.parameters or (len(FACTORS) if VARIED else 1), spec.parameters > 0
+    LEARNED, NPARAMETERS = spec.parameters > 0, max(spec.parameters, 1)
     PULLED = MUSCLE or TENDON or SITE
     TENSIONS, BODIES = (NU if PULLED else 1), max(spec.forced, 1)
 
@@ -180,7 +179,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         ck: Ck,
         # out
         adj: Adjoints,
-        adj_factors: Array,
+        adj_parameters: Array,
     ):
         """Compute the partial derivatives of phi of each link into adj."""
         for i in range(1, INERT + 1):
@@ -188,15 +187,17 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         s = int(0)  # the contact in the checkpoint
         for i in range(FIRST, here.n):
             k = here.at + i
-            own = link.link_adjoint(m, here, k, links[i], nodes[i], carrier, adj_factors)
+            own = link.link_adjoint(m, here, k, links[i], nodes[i], carrier)
             if wp.static(CONSTRAINED and CONTACT):
-                own, s = ground.add_contacts_adjoint(m, here, k, s, links[i], nodes[i], carrier, ck, own, adj_factors)
+                own, s = ground.add_contacts_adjoint(
+                    m, here, k, s, links[i], nodes[i], carrier, ck, own, adj_parameters
+                )
             if wp.static(DAMPED):
-                own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own, adj_factors)
+                own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own)
             adj[i] = own
 
     @wp.func
-    def joint_derivatives(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
+    def joint_derivatives(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node):
         """Differentiate the joint's force with respect to q and qd, and to that of its motors."""
         k = here.at + i
         end_qd = link.qd
@@ -206,19 +207,12 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(CLAMP):
             unclamped = own.unclamped
         derivatives = joint.derivatives(m, here, k, link.q, link.qd, end_qd, unclamped)
-        if wp.static(VARIED and LIMIT):
-            by = joint.limit_constants_derivatives(m, here, k, link.q, link.qd, end_qd)
-            adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * by[0]  # of one lane with the joint
-            adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - T(m.owned[k]) * own.lam * by[1]
         if wp.static(CONSTRAINED):
-            con_derivatives = limits.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
-            derivatives = derivatives + vec2(con_derivatives[0], con_derivatives[1])
-            if wp.static(VARIED):
-                adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * con_derivatives[2]
+            derivatives = derivatives + limits.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
         return derivatives, unclamped
 
     @wp.func
-    def inward(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints, adj_factors: Array):
+    def inward(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints):
         """Sum adj over subtrees and project it on the joints."""
         slots = int(SLOTS)
         if wp.static(SHARERS > 1):
@@ -236,7 +230,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     p = m.inboard[k]
                     turned = m.outboard[k]
                 own = nodes[i]
-                derivatives, unclamped = joint_derivatives(m, here, i, ck, links[i], own, adj_factors)
+                derivatives, unclamped = joint_derivatives(m, here, i, ck, links[i], own)
                 S = links[i].S
                 total = adj[i]
                 xv = total.v - wp.spatial_cross_dual(links[p].V, total.a)
@@ -299,7 +293,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
 
     @wp.func
     def count_nonfinite(
-        m: Model, here: Lane, base: Base, nodes: Nodes, adj_tension: Array, adj_factors: Array, adj_forces: t.vec6s
+        m: Model, here: Lane, base: Base, nodes: Nodes, adj_tension: Array, adj_parameters: Array, adj_forces: t.vec6s
     ):
         """Count numbers of the gradient that are not finite."""
         failed = T(0.0)
@@ -315,9 +309,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 failed = failed + block.is_nonfinite(adj_tension[m.muscle[entry]])
         if wp.static(TENDON or SITE):
             failed = failed + transmission.count_nonfinite(adj_tension)
-        if wp.static(VARIED or LEARNED):
-            for k in range(NFACTORS):
-                failed = failed + block.is_nonfinite(adj_factors[k])
+        if wp.static(LEARNED):
+            for k in range(NPARAMETERS):
+                failed = failed + block.is_nonfinite(adj_parameters[k])
         if wp.static(FORCED):
             failed = failed + force.count_nonfinite_forces(m, here, adj_forces)
         if wp.static(THREADS_PER_ENV > 1):
@@ -336,14 +330,13 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         here: Lane,
         # controls and gradients in
         drop: T,
-        ctrl: t.array2,
         nodes: Nodes,
         adj_tension: Array,
-        adj_factors: Array,
+        adj_parameters: Array,
         # out
         g: t.Batch,
     ):
-        """Write the gradients of controls and factors."""
+        """Write the gradients of controls and parameters."""
         for k in range(NU):
             if m.motor_lane[k] == here.lane:
                 g_force = T(0.0)
@@ -352,13 +345,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(PULLED):
                     g_force = g_force + adj_tension[k]
                 if wp.static(VARIED):
-                    motor = T(m.gear[k]) * read(ctrl, here.e, k) + T(m.motor_bias[k])
-                    adj_factors[MOTOR] = adj_factors[MOTOR] + g_force * motor
                     g_force = here.motor * g_force
                 write_gradient(g.ctrl, here.e, k, drop, g_force * T(m.gear[k]))
-        if wp.static(VARIED or LEARNED):
-            for k in range(NFACTORS):
-                total = adj_factors[k]
+        if wp.static(LEARNED):
+            for k in range(NPARAMETERS):
+                total = adj_parameters[k]
                 if wp.static(THREADS_PER_ENV > 1):
                     total = sums.add(total)
                 if here.lane == 0:
@@ -414,7 +405,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)
         if wp.static(PAIRS):
             contacts = wp.zeros(shape=BLOCKS, dtype=Contact)
-        adj_factors = wp.zeros(shape=NFACTORS, dtype=T)
+        adj_parameters = wp.zeros(shape=NPARAMETERS, dtype=T)
         adj_forces = wp.zeros(shape=BODIES, dtype=vec6)
         tension = wp.zeros(shape=TENSIONS, dtype=T)
         adj_tension = wp.zeros(shape=TENSIONS, dtype=T)
@@ -452,11 +443,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             solve(m, here, ck, links, nodes, base)
             if wp.static(PAIRS):
                 pairs.correct_lambda(m, here, links, ck, contacts, nodes)
-            partials(m, here, links, nodes, carrier, ck, adj, adj_factors)
+            partials(m, here, links, nodes, carrier, ck, adj, adj_parameters)
             if wp.static(LEARNED):
-                parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_factors)
+                parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_parameters)
             if wp.static(PAIRS):
-                pairs.add_adjoint(m, here, links, contacts, nodes, adj, adj_factors)
+                pairs.add_adjoint(m, here, links, contacts, nodes, adj, adj_parameters)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):
@@ -465,19 +456,19 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 transmission.add_tendons_adjoint(m, here, batch.ctrl, links, nodes, adj_tension)
             if wp.static(SITE):
                 transmission.add_sites_adjoint(m, here, batch.ctrl, links, nodes, adj, adj_tension)
-            inward(m, here, ck, links, nodes, adj, adj_factors)
+            inward(m, here, ck, links, nodes, adj)
             if wp.static(BALL_SPRING):
                 ball_springs(m, here, links, nodes)
             if wp.static(FLOATING):
                 base = base_inward(m, links[0], nodes[0], adj[0], base)
 
         # A gradient that is not finite, or of an environment that kept its state, is zero.
-        failed = count_nonfinite(m, here, base, nodes, adj_tension, adj_factors, adj_forces)
+        failed = count_nonfinite(m, here, base, nodes, adj_tension, adj_parameters, adj_forces)
         contained = block.read_flags(nonfinite, here.e)
         if here.lane == 0:
             block.count(nonfinite_gradients, here.e, pick(T(0.0), contained, T(0.0), failed))
         drop = failed + contained
-        write_controls(m, here, drop, batch.ctrl, nodes, adj_tension, adj_factors, g)
+        write_controls(m, here, drop, nodes, adj_tension, adj_parameters, g)
         if wp.static(FORCED):
             force.write_forces_adjoint(m, here, drop, adj_forces, g.forces)
         write_state(m, here, drop, batch.qpos, base, nodes, g)
