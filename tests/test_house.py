@@ -19,7 +19,7 @@ ROOMS = {  # as they are drawn
     "tasks/": "diffsim/tasks/*.py",
     "sim/": "diffsim/sim/*.py",
     "kernels/": "diffsim/kernels/**/*.py",
-    "transmission": "diffsim/kernels/*.py",
+    "forward, backward, newton, ...": "diffsim/kernels/*.py",
     "pairs/": "diffsim/kernels/pairs/*.py",
     "mujoco/": "diffsim/kernels/mujoco/*.py",
     "laws/": "diffsim/kernels/laws/*.py",
@@ -35,8 +35,9 @@ def lines(pattern: str) -> int:
 
 def test_the_rooms_are_as_large_as_they_are_drawn() -> None:
     (drawing,) = re.findall(r"^An import goes down.*?```\n(.*?)^```$", CONTRIBUTING.read_text(), re.M | re.S)
-    drawn = {name: int(number.replace(",", "")) for name, number in re.findall(r"([\w/., ]+?) \(([\d,]+)\)", drawing)}
-    drawn = {name.strip().removeprefix("forward, backward, newton, parameters, "): size for name, size in drawn.items()}
+    drawn = {
+        name.strip(): int(number.replace(",", "")) for name, number in re.findall(r"([\w/., ]+?) \(([\d,]+)\)", drawing)
+    }
     counted = {name: lines(pattern) for name, pattern in ROOMS.items()}
     print(counted)
     assert drawn == {name: round(size, -2) for name, size in counted.items()}

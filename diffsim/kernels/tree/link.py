@@ -21,6 +21,8 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
     # With MuJoCo's constraints contacts are added in each pass of the solve: mujoco/ground.py.
     GRAVCOMP, DRAG, CONTACT = spec.has("gravcomp drag contact")
     CONTACT = CONTACT and not spec.constrained
+    NBALL, INERT = spec.nball, spec.inert
+    FIRST = 0 if spec.floating else 1 + INERT  # the first link with inertia
 
     @wp.func
     def world_inertia(m: Model, k: int, link: Link):
@@ -58,6 +60,19 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(CONTACT):
             load = contact.add_contacts(m, here, k, link, carrier, load)
         return load
+
+    @wp.func
+    def outward(m: Model, here: Lane, carrier: t.CarrierPos, links: t.Links, motions: t.Motions, loads: t.Loads):
+        """Compute the links' velocity products, inertias and bias forces from their kinematics."""
+        for i in range(1, here.n):
+            turning = i
+            if wp.static(NBALL > 0):
+                turning = m.inboard[here.at + i]
+            motions[i].C = wp.spatial_cross(links[turning].V, links[i].S * links[i].qd)
+        for i in range(1, INERT + 1):
+            loads[i] = Load()
+        for i in range(FIRST, here.n):
+            loads[i] = link_inertia(m, here, here.at + i, links[i], carrier)
 
     @wp.func
     def link_adjoint(m: Model, here: Lane, k: int, link: Link, node: Node, carrier: CarrierPos):
