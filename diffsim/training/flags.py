@@ -64,8 +64,8 @@ class Flags:
     """simulation steps per control step (per task, --contact and --accuracy)"""
     implicit: bool = False
     """on soft contact, damping and friction act at the end of a substep (per task and --accuracy)"""
-    onset: Fraction = 0.0
-    """on MuJoCo's contact, metres over which contacts of the training begin; 0: as in the file (docs/transfer.md)"""
+    onset: tuple[Fraction, Fraction] = (0.0, 0.0)
+    """on MuJoCo's contact, metres over which contacts begin, first and last in training (0: as in the file)"""
     compile: bool = False
     """fuse torch's operations with torch.compile: on a GPU shorter iterations, a longer start (docs/performance.md)"""
     threads: Natural = 0
@@ -84,7 +84,7 @@ class Flags:
         """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""
         if self.contact == "mujoco" and self.implicit:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
-        if self.contact != "mujoco" and self.onset:
+        if self.contact != "mujoco" and any(self.onset):
             fail(f"--onset is for --contact mujoco, and the contact is {self.contact}")
         if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
@@ -138,7 +138,7 @@ def _presets(args: Flags) -> dict[str, Any]:
         how = find_task(args.env).integration(args.accuracy, args.contact)
     except ValueError as error:
         fail(error)
-    onset = {} if how.contact == "mujoco" else {"onset": 0.0}
+    onset = {} if how.contact == "mujoco" else {"onset": (0.0, 0.0)}
     return {"substeps": how.substeps, "implicit": how.implicit} | onset
 
 
