@@ -129,6 +129,7 @@ def test_gradient_of_small_robots_is_that_of_differences(name, rng):
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))
 
 
+@pytest.mark.unoptimized
 @pytest.mark.parametrize("implicit", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_gradient_of_bounded_servos_is_that_of_differences(implicit, rng):
     """At a bound the force depends on nothing; also with factors of motors and mass."""

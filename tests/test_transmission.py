@@ -22,6 +22,7 @@ from diffsim.tasks.own_task import start_control
 
 EXACT = Integration("mujoco", 1, tolerance=1e-12)
 CASES = ["implicitfast", "Euler", "drone"]
+pytestmark = pytest.mark.unoptimized
 
 
 def case(name: str, count: int, rng: np.random.Generator) -> tuple[Scene, list[np.ndarray]]:
