@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from diffsim.robot.elements import control_range, label, listed, motors, muscles
-from diffsim.robot.geoms import (
+from diffsim.robot.contacts import (
     HULL_POINTS,
     base_geoms,
     contact_points,
@@ -17,6 +16,7 @@ from diffsim.robot.geoms import (
     matrix_of,
     pair_law,
 )
+from diffsim.robot.elements import control_range, label, listed, motors, muscles
 from diffsim.robot.pairs import as_primitives, deviation, directions, is_exact, obstacle_geoms, reach, self_pairs
 from diffsim.robot.scene import Scene
 from diffsim.tasks.own_task import start_control

@@ -89,7 +89,7 @@ class Joystick(Task):
 
     robot: ClassVar[Robot]
     contact: ClassVar[Contact] = "mujoco"
-    symmetric = True
+    symmetric, initial_gain = True, 0.01
     varied_by = "diffsim_robots.variation:Variation"
     ranges: ClassVar[Ranges] = {
         "friction": (0.7, 1.3),

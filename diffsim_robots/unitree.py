@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, ClassVar
 
+from diffsim.tasks.base import Defaults
 from diffsim_robots.joystick import WEIGHTS, Joystick, Leg, Robot
 
 
@@ -42,16 +44,35 @@ def _humanoid() -> Robot:
     return Robot(joints, home, 0.755, legs, 0.65, 0.08, 1.4, (("right_", "left_"),), apart=0.13)
 
 
+# Learners begin near the standing pose, with little noise.
+BEGIN: dict[str, Any] = {
+    "critic_hidden": (256, 128),
+    "critic_lr": 1e-3,
+    "target_alpha": 0.9,
+    "initial_log_std": -2.0,
+    "adjoint_clip": 5.0,
+}
+BEGIN_RPO = BEGIN | {"horizon": 16, "num_envs": 64, "critic_iterations": 4, "epochs": 4, "trust": 0.5}
+QUADRUPED: Defaults = {
+    "shac": BEGIN | {"iterations": 600},
+    "shac gpu": {"num_envs": 1024, "iterations": 1000},
+    "rpo": BEGIN_RPO | {"iterations": 400},
+    "rpo gpu": {"num_envs": 1024},
+}
+
+
 class Go1(Joystick):
     """12 joints; action: targets of the servos."""
 
     name, asset, robot = "go1", "go1.xml", _quadruped(("FR", "FL", "RR", "RL"))
+    defaults = QUADRUPED
 
 
 class Go2(Joystick):
     """12 joints; action: targets of servos on the motors."""
 
     name, asset, robot = "go2", "go2.xml", _quadruped(("FL", "FR", "RL", "RR"))
+    defaults = QUADRUPED
 
 
 class G1(Joystick):
@@ -60,3 +81,11 @@ class G1(Joystick):
     name, asset, robot = "g1", "g1.xml", _humanoid()
     weights = WEIGHTS | {"alive": 2.5, "action_rate": -1.0}
     ranges = {name: Joystick.ranges[name] for name in ("friction", "mass", "motor", "latency")} | {"push": (0.5, 1.5)}
+    defaults: ClassVar[Defaults] = {
+        "shac": BEGIN | {"horizon": 16, "iterations": 1500},
+        "rpo": BEGIN_RPO | {"initial_log_std": -3.0, "iterations": 600},
+        "rpo gpu": {"num_envs": 1024},
+        "sapo": BEGIN | {"horizon": 16, "target_entropy": (-1.0, -1.0), "critic_iterations": 4, "iterations": 1200},
+        "sapo gpu": {"num_envs": 1024},
+        "sapo cpu": {"iterations": 700},
+    }

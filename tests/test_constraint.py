@@ -35,7 +35,8 @@ from test_terrain import HILLS, everywhere, hopping, pressed
 import diffsim
 from diffsim.kernels.mujoco import ground
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import FACTORS, SceneError
+from diffsim.robot.scene import FACTORS
+from diffsim.robot.types import SceneError
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator

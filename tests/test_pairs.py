@@ -18,7 +18,8 @@ from test_constraint import CONES, STATES, H, check_gradients, in_mujoco, mujoco
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constants import constrained
 from diffsim.robot.pairs import as_primitives, with_pairs
-from diffsim.robot.scene import FACTORS, SceneError
+from diffsim.robot.scene import FACTORS
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim_cli.report import approximations, report

@@ -14,7 +14,8 @@ from test_gradient import check_gradients as check_soft_gradients
 
 from diffsim.parameters import ParametricSimulator
 from diffsim.robot.elements import control_range
-from diffsim.robot.scene import FACTORS, Scene, SceneError
+from diffsim.robot.scene import FACTORS, Scene
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.symmetry.mirror import reflections

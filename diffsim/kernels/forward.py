@@ -14,9 +14,8 @@ import warp as wp
 from diffsim.kernels.laws.force import external_force
 from diffsim.kernels.laws.joint import joint_law
 from diffsim.kernels.laws.muscle import muscle_law
-from diffsim.kernels.mujoco.ground import contact_room, ground_contact
+from diffsim.kernels.mujoco.ground import contact_room
 from diffsim.kernels.newton import newton_method
-from diffsim.kernels.pairs.rows import pair_rows
 from diffsim.kernels.state import state_access
 from diffsim.kernels.thread.lane import lane_of
 from diffsim.kernels.thread.model import types
@@ -27,25 +26,24 @@ from diffsim.kernels.transmission import transmission_law
 from diffsim.kernels.tree.integrator import integrator
 from diffsim.kernels.tree.kinematics import kinematics
 from diffsim.kernels.tree.link import link_law
-from diffsim.kernels.tree.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
+from diffsim.kernels.tree.solve import SOLVE, articulated
 
 
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     """Make the kernel that steps the environments of a specification."""
     t, kin, block, lane, join = types(spec), kinematics(spec), blocks(spec), lane_of(spec), spatial(spec).join
-    T, vec3, vec6, quat, Model, Newton, pick = t.T, t.vec3, t.vec6, t.quat, t.Model, t.Newton, block.pick
+    T, quat, Model, pick = t.T, t.quat, t.Model, block.pick
     Load, Link, Motion, Contact = t.Load, t.Link, t.Motion, t.Contact
     link, joint, force, muscle = link_law(spec), joint_law(spec), external_force(spec), muscle_law(spec)
-    state, sweep, euler = state_access(spec), articulated(spec), integrator(spec)
-    ground, newton, pairs = ground_contact(spec), newton_method(spec), pair_rows(spec) if spec.pairs else None
-    CONTACT, MOTOR, MUSCLE, TENDON, SITE, CHAIN = spec.has("contact motor muscle tendon site tendon_chain")
+    state, sweep, euler, newton = state_access(spec), articulated(spec), integrator(spec), newton_method(spec)
+    MOTOR, MUSCLE, TENDON, SITE = spec.has("motor muscle tendon site")
     transmission = transmission_law(spec) if TENDON or SITE else None
-    FLOATING, FORCED, CONSTRAINED, DAMPED = spec.floating, spec.forced > 0, spec.constrained, spec.damped
-    PAIRS, SOLVES, NV, NBALL, SLOTS = spec.pairs > 0, spec.solves, spec.nv, spec.nball, spec.room
+    FLOATING, FORCED, CONSTRAINED = spec.floating, spec.forced > 0, spec.constrained
+    NV, NBALL, SLOTS = spec.nv, spec.nball, spec.room
     # Local arrays have at least one element, also where they are not read.
-    GROUND, BALLS, TENSIONS = contact_room(spec), max(NBALL, 1), spec.nu if MUSCLE else 1
-    CONTACTS = GROUND + spec.pair_sizes.blocks
+    CONTACTS, BALLS = contact_room(spec) + spec.pair_sizes.blocks, max(NBALL, 1)
+    TENSIONS = spec.nu if MUSCLE else 1
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def forward(
@@ -106,75 +104,24 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(SITE):
                 transmission.add_sites(m, here, batch.ctrl, links, loads)
             # 2. inward and outward: articulated inertias, then accelerations. With constraints each pass is a step of
-            # Newton's method (newton.py), and the adjoint uses the factor of the last iterate. MuJoCo's implicit
-            # damping is one more solve: (M + h b) change = -h b a.
+            # Newton's method.
             if wp.static(CONSTRAINED):
-                status = Newton()
-                status.tolerance = T(tolerance)
-                status.active = T(1.0)
-                status.accel_sq = T(1.0)
-                root.newton_vdot = vec3()
-                root.newton_wdot = vec3()
-                root.wdot = vec3()
-                root.vdot = vec3()
-                if wp.static(CONTACT):
-                    here.contacts = ground.begin_contacts(m, here, links, carrier, motions, contacts)
-                newton.initialize(m, here, links, motions, loads, free_loads, root)
-                if wp.static(PAIRS):
-                    here.begin = int(GROUND)
-                    here.end = pairs.begin(m, here, links, motions, root.pos, contacts)
-                phase = int(NEWTON)
-                while phase < DONE:
-                    if phase == NEWTON and (status.passes == passes or not block.any_of(status.active)):
-                        residual = wp.max(residual, status.residual_sq)
-                        phase = DONE - int(DAMPED)
-                        if record == 1:
-                            phase = FACTOR
-                    if phase < DONE:
-                        here.factor_row = SOLVES * here.row
-                        if wp.static(DAMPED):
-                            if phase == FACTOR:
-                                here.factor_row = here.factor_row + 1
-                        if phase == SOLVE:
-                            for i in range(here.n):
-                                loads[i] = free_loads[i]
-                                loads[i].f = vec6()
-                        else:
-                            newton.linearize(m, here, motions, contacts, free_loads, loads)
-                        here.store_factor = record * wp.where(phase > NEWTON, 1, 0)
-                        sweep.inward(m, here, phase, ck, links, motions, loads)
-                        root = sweep.accelerate(m, here, phase, ck, links, motions, loads[0], root)
-                        if phase == NEWTON:
-                            if wp.static(PAIRS):
-                                root = pairs.correct_step(m, here, links, contacts, motions, root, status)
-                            root, status = newton.newton_step(
-                                m, here, links, free_loads, motions, contacts, root, status
-                            )
-                        else:
-                            if wp.static(CHAIN):
-                                if phase == SOLVE:
-                                    root = transmission.correct_change(m, here, links, motions, root)
-                            phase = phase + 1
-                            if wp.static(not DAMPED):
-                                phase = DONE
-                for i in range(1, here.n):
-                    change = motions[i].u
-                    motions[i].u = motions[i].accel_joint
-                    if wp.static(DAMPED):
-                        motions[i].accel_joint = motions[i].accel_joint + change
-                if record == 1:  # the acceleration before damping, at which the adjoint differentiates the constraints
-                    state.record_accelerations(m, here, ck, NV, root.newton_vdot, root.newton_wdot, motions)
-                    if wp.static(CONTACT):
-                        ground.record_contacts(here, ck, contacts)
-                    if wp.static(PAIRS):
-                        pairs.record(here, ck, contacts)
-                for i in range(1, here.n):
-                    motions[i].u = motions[i].accel_joint
-                if wp.static(not DAMPED):
-                    root.vdot = vec3()
-                    root.wdot = vec3()
-                root.vdot = root.newton_vdot + root.vdot
-                root.wdot = root.newton_wdot + root.wdot
+                here, root, residual_sq = newton.accelerate(
+                    m,
+                    here,
+                    passes,
+                    T(tolerance),
+                    links,
+                    carrier,
+                    loads,
+                    motions,
+                    root,
+                    free_loads,
+                    contacts,
+                    record,
+                    ck,
+                )
+                residual = wp.max(residual, residual_sq)
             else:
                 here.factor_row = here.row
                 here.store_factor = record

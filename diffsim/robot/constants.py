@@ -14,10 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
-from diffsim.robot.geoms import ground_pairs, pair_law
+from diffsim.robot.contacts import ground_pairs, pair_law
+from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed, takes_euler
 from diffsim.robot.pairs import GEOMS, Pairs, rows_of
-from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene, SceneError, takes_euler
+from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
+from diffsim.robot.types import Array, SceneError
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5

@@ -11,9 +11,10 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffsim.robot.contacts import UNBOUNDED, base_geoms, collide, declared_pairs, hull, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
-from diffsim.robot.geoms import UNBOUNDED, base_geoms, collide, declared_pairs, hull, matrix_of, pair_law
-from diffsim.robot.scene import Array, Index, Scene, SceneError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array, Index, SceneError
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
 Touch = Callable[[int, int], Array]  # two geoms

@@ -15,7 +15,7 @@ import torch
 
 from diffsim.env import ActionError
 from diffsim.robot.profile import TerrainError
-from diffsim.robot.scene import SceneError
+from diffsim.robot.types import SceneError
 from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError
 from diffsim.tasks import TaskError

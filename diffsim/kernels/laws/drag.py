@@ -23,6 +23,7 @@ from diffsim.kernels.thread.spec import KernelSpec
 
 @cache
 def drag_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the fluid's wrench on a link, and its adjoint."""
     t, sp = types(spec), spatial(spec)
     T, vec3, vec6, mat3, Model = t.T, t.vec3, t.vec6, t.mat3, t.Model
     join, force_at, point_velocity = sp.join, sp.force_at, sp.point_velocity

@@ -27,6 +27,7 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the law of soft contact, and its adjoint."""
     t, sp, block = types(spec), spatial(spec), blocks(spec)
     T, vec3, vec4, Model, Lane, Link = t.T, t.vec3, t.vec4, t.Model, t.Lane, t.Link
     Node, Adjoint = t.Node, t.Adjoint

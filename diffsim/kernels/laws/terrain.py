@@ -28,6 +28,7 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
+    """Make the ground's distance from a sphere, and the frame of what the sphere touches."""
     t, block, BLOCK, TERRAIN = types(spec), blocks(spec), spec.block, "terrain" in spec.features
     FRAMED = spec.framed
     T, U, vec3, vec4, mat3, Model, uvec4 = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.scene.vec4

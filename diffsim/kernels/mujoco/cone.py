@@ -30,6 +30,7 @@ def friction_cone(spec: KernelSpec) -> SimpleNamespace:
 
 @cache
 def elliptic_cone(spec: KernelSpec) -> SimpleNamespace:
+    """Make the force of a contact in an elliptic cone."""
     t, pick = types(spec), blocks(spec).pick
     T, vec3, mat3 = t.T, t.vec3, t.mat3
 
@@ -78,6 +79,7 @@ def elliptic_cone(spec: KernelSpec) -> SimpleNamespace:
 
 @cache
 def pyramidal_cone(spec: KernelSpec) -> SimpleNamespace:
+    """Make the same of a pyramidal cone, and its heading."""
     t, pick, in_frame = types(spec), blocks(spec).pick, terrain_contact(spec).in_frame
     T, U, vec3, vec4, mat3 = t.T, t.U, t.vec3, t.vec4, t.mat3
 

@@ -13,6 +13,7 @@ import warp as wp
 from diffsim.kernels.laws.terrain import terrain_contact
 from diffsim.kernels.mujoco.cone import friction_cone
 from diffsim.kernels.mujoco.impedance import impedance_law
+from diffsim.kernels.thread.columns import CONTACT
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -157,8 +158,8 @@ def ground_contact(spec: KernelSpec) -> SimpleNamespace:
     def trial_contacts(
         m: Model, here: Lane, begin: int, end: int, step: vec6, alpha: T, evaluation: int, contacts: t.Contacts
     ):
-        """Evaluate a link's contacts after the trial step alpha step; returns their part of newton.evaluate_trial."""
-        total = vec6()
+        """Evaluate a link's contacts after the trial step alpha step; returns their Trial."""
+        total = t.Trial()
         for s in range(begin, end):
             c = contacts[s].sphere
             step_jar = point_velocity(step, contacts[s].p)
@@ -172,14 +173,11 @@ def ground_contact(spec: KernelSpec) -> SimpleNamespace:
             force_error = contacts[s].f - alpha * contacts[s].Hs - f
             w = T(m.contact_params[c][4])
             accel_error = impedance.acceleration_for(force_error, w, H)
-            total = total + vec6(
-                wp.dot(step_jar, force_error),
-                wp.dot(step_jar, contacts[s].Hs),
-                wp.dot(step_jar, H * step_jar),
-                wp.dot(accel_error, accel_error),
-                w * wp.trace(H),
-                T(0.0),
-            )
+            total.slope = total.slope + wp.dot(step_jar, force_error)
+            total.linear = total.linear + wp.dot(step_jar, contacts[s].Hs)
+            total.curvature = total.curvature + wp.dot(step_jar, H * step_jar)
+            total.error_sq = total.error_sq + wp.dot(accel_error, accel_error)
+            total.stiffness = total.stiffness + w * wp.trace(H)
             contacts[s].trial_jar = jar
             contacts[s].trial_force = f
             contacts[s].H = H
@@ -220,7 +218,7 @@ def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
     in_frame, in_world, cone = terrain_contact(spec).in_frame, terrain_contact(spec).in_world, friction_cone(spec)
     (TERRAIN, PYRAMID), FRAMED = spec.has("terrain pyramid"), spec.framed
     NV, ROOM = spec.nv, contact_room(spec)
-    LEARNED, COLUMNS = spec.parameters > 0, spec.parameters - 2 * (spec.spheres + spec.pairs)  # see parameters.py
+    LEARNED, COLUMNS = spec.parameters > 0, spec.columns.ground
 
     @wp.func
     def recorded_sphere(here: Lane, s: int, ck: t.Checkpoint):
@@ -264,8 +262,8 @@ def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
             g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
             if wp.static(LEARNED):
                 by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                adj_parameters[COLUMNS + 2 * c] = adj_parameters[COLUMNS + 2 * c] - by_mu
-                adj_parameters[COLUMNS + 2 * c + 1] = adj_parameters[COLUMNS + 2 * c + 1] + wp.dot(f, w)
+                adj_parameters[COLUMNS + CONTACT * c] = adj_parameters[COLUMNS + CONTACT * c] - by_mu
+                adj_parameters[COLUMNS + CONTACT * c + 1] = adj_parameters[COLUMNS + CONTACT * c + 1] + wp.dot(f, w)
             if wp.static(FRAMED):  # adjoint of a rotation of the frame
                 g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
             if wp.static(PYRAMID):

@@ -30,7 +30,7 @@ from diffsim.kernels.thread.wide import blocks
 def impedance_law(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of a row's impedance, which the ground, limits and rows between bodies share."""
     t, pick = types(spec), blocks(spec).pick
-    T, U, vec3, vec4, mat3, Params = t.T, t.U, t.vec3, t.vec4, t.mat3, t.scene.vec11
+    T, U, vec3, vec4, mat3, Params, Trial = t.T, t.U, t.vec3, t.vec4, t.mat3, t.scene.vec11, t.Trial
 
     @wp.func
     def impedance_row(c: Params, stiffness: T, r: T):
@@ -73,6 +73,16 @@ def impedance_law(spec: KernelSpec) -> SimpleNamespace:
         x[2] = (x[2] - v * x[1]) / wp.max(T(1.0) + G[2, 2] - z * G[2, 0] - v * e, T(1.0))
         x[1] = c * x[1] - v * x[2]
         x[0] = d * x[0] - y * x[1] - z * x[2]
+        return x
+
+    @wp.func
+    def add_trials(x: Trial, y: Trial):
+        """Return the sum of two trials' numbers."""
+        x.slope = x.slope + y.slope
+        x.linear = x.linear + y.linear
+        x.curvature = x.curvature + y.curvature
+        x.error_sq = x.error_sq + y.error_sq
+        x.stiffness = x.stiffness + y.stiffness
         return x
 
     return functions(locals())

@@ -34,6 +34,7 @@ def joint_limits(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def limit_damping(m: Model, here: Lane, i: int):
+        """Return b of joint i's limit."""
         b = T(m.limit_params[i][1])
         if wp.static(VARIED):
             b = wp.sqrt(here.k_limit) * b

@@ -40,7 +40,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
     SOLVES, LEARNED = spec.solves, spec.parameters > 0
     COLUMN = pair_column(spec)  # of jar in the checkpoint
-    COLUMNS = spec.parameters - 2 * spec.pairs  # see parameters.py
+    COLUMNS = spec.columns.pairs
     JOINTS, POINTS, TURNS, TOUCH = spec.has("joint_rows point_rows turn_rows geoms_rows")
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]
 

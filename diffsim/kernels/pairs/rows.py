@@ -171,9 +171,9 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def trial(m: Model, here: Lane, motions: Motions, alpha: T, contacts: Contacts):
-        """Evaluate the rows after the trial step alpha s; returns their part of newton.evaluate_trial."""
-        total = vec6()
-        total[3] = contacts[here.begin + LAST].D  # no solution where a contact has no room
+        """Evaluate the rows after the trial step alpha s; returns their Trial."""
+        total = t.Trial()
+        total.error_sq = contacts[here.begin + LAST].D  # no solution where a contact has no room
         for c in range(here.begin, here.end):
             s = contacts[c].row
             i, j = geometry.ends(m, s)
@@ -183,14 +183,11 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
             force_error = contacts[c].f - alpha * contacts[c].Hs - f
             w = T(m.row_params[s][4])
             accel_error = constraint.acceleration_for(force_error, w, H)
-            total = total + vec6(
-                wp.dot(step_jar, force_error),
-                wp.dot(step_jar, contacts[c].Hs),
-                wp.dot(step_jar, H * step_jar),
-                wp.dot(accel_error, accel_error),
-                w * wp.trace(H),
-                T(0.0),
-            )
+            total.slope = total.slope + wp.dot(step_jar, force_error)
+            total.linear = total.linear + wp.dot(step_jar, contacts[c].Hs)
+            total.curvature = total.curvature + wp.dot(step_jar, H * step_jar)
+            total.error_sq = total.error_sq + wp.dot(accel_error, accel_error)
+            total.stiffness = total.stiffness + w * wp.trace(H)
             contacts[c].trial_jar = jar
             contacts[c].trial_force = f
             contacts[c].H = H

@@ -15,6 +15,7 @@ from diffsim.kernels.thread.spec import KernelSpec
 
 @cache
 def lane_sums(spec: KernelSpec) -> SimpleNamespace:
+    """Make the sums over an environment's lanes."""
     t, threads = types(spec), spec.threads_per_env
     T, vec6, mat3 = t.T, t.vec6, t.mat3
     neighbour = f"""

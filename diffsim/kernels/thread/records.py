@@ -75,6 +75,14 @@ def add_constraints(
             "accel_sq": T,  # 1 plus the square of the acceleration
             "passes": int,  # so far
         },
+        # Constraints after a trial step alpha s, whose forces f are linearised to f - H s: sums over their rows
+        "Trial": {
+            "slope": T,  # s . (f - alpha H s - f(alpha s)), the part of the cost's slope that is not linear
+            "linear": T,  # s . H s
+            "curvature": T,  # s . H(alpha s) s
+            "error_sq": T,  # square of that difference of forces as an acceleration
+            "stiffness": T,  # ratio of contact stiffness to inertia
+        },
         # A contact with MuJoCo's law
         "Contact": {
             "p": vec3,  # the contact point, about the carrier

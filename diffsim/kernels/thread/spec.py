@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+from diffsim.kernels.thread.columns import Columns
 from diffsim.kernels.thread.division import Division
 from diffsim.robot.pairs import PairSizes
 from diffsim.robot.scene import Scene
@@ -85,6 +86,11 @@ class KernelSpec:
         """Tell whether damping follows the constraints."""
         *dampers, explicit = self.has("damping base_damping tendon_damping explicit_damping")
         return self.constrained and any(dampers) and not explicit
+
+    @property
+    def columns(self) -> Columns:
+        """Return where the gradients by the scene's constants are, if it has parameters."""
+        return Columns.of(self.nlink, self.nu, self.spheres, self.pairs)
 
     @property
     def nfactor(self) -> int:

@@ -14,6 +14,7 @@ from diffsim.kernels.thread.spec import KernelSpec
 
 @cache
 def link_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make a link's part of the equations of motion, and its adjoint."""
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, mat3, Model, Lane, Link = t.T, t.vec3, t.mat3, t.Model, t.Lane, t.Link
     Node, Adjoint = t.Node, t.Adjoint
@@ -116,6 +117,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_adjoints(x: Adjoint, y: Adjoint):
+        """Return the sum of two adjoints."""
         x.a = x.a + y.a
         x.v = x.v + y.v
         x.w = x.w + y.w
