@@ -242,12 +242,13 @@ NAMES = {
     **{"shac_8": "SHAC", "ppo_8": "PPO, 4,096 environments", "ppo_16": "PPO, 4,096 environments"},
     **{f"shac_h{steps}": f"SHAC, rollouts of {steps} steps" for steps in (4, 8, 16, 64, 128)},
     **{"shac_no_critic": "SHAC without critic", "pods": "PODS", "pods_second": "PODS, second order"},
-    **{"pfpn_ppo": "particles", "pfpn_gaussian_ppo": "Gaussian"},
+    **dict.fromkeys(("pfpn_ppo", "pfpn_sac"), "particles"),
+    **dict.fromkeys(("pfpn_gaussian_ppo", "pfpn_gaussian_sac"), "Gaussian"),
 }
 COLOURS = {
     **{"rpo": "C0", "shac": "C1", "sapo": "C2", "ppo_baseline": "C3", "ppo_4096": "C3", "ppo_8": "C3", "ppo_16": "C3"},
     **{"bptt": "C4", "sac_baseline": "C5", "sac_large": "C5", "redq": "C6", "redq_500": "C6", "mbpo": "C7"},
-    **{"se_mbpo": "C8", "pods": "C8", "pfpn_ppo": "C9", "shac_8": "C1"},
+    **{"se_mbpo": "C8", "pods": "C8", "pfpn_ppo": "C9", "pfpn_sac": "C9", "shac_8": "C1"},
 }
 OTHERS = "kbgmcy"
 

@@ -47,8 +47,18 @@ def lines(machine: str) -> dict[tuple[str, str], Row]:
         seeds = own.get((task, learner), [])
         if len(seeds) > 2 and len({row["trained on"] for row in seeds}) == 1:
             total = next((row["in all (s)"] for row in seeds if row["seed"] == "1"), "")
-            found[task, learner] = {**paper.line(seeds), "seed 1 in all (s)": f"{float(total):.0f}" if total else ""}
+            shown: Row = {**paper.line(seeds), "seed 1 in all (s)": f"{float(total):.0f}" if total else ""}
+            name = (
+                f"{NAMES[learner]}{cpu(seeds[0]['trained on']) if machine == 'cpu' and shown['training (s)'] else ''}"
+            )
+            found[task, learner] = {**shown, "learner": name}
     return found
+
+
+def cpu(trained_on: str) -> str:
+    """Name the CPU in brackets: "2 of 16 cores of Intel(R) Xeon(R) Processor" is (Xeon, 2 of 16)."""
+    share, _, kind = trained_on.partition(" cores of ")
+    return f" ({'EPYC' if 'EPYC' in kind else 'Xeon'}{f', {share}' if 'of' in share else ''})"
 
 
 def gpu() -> list[Row]:
@@ -93,13 +103,11 @@ def compared() -> Iterator[Row]:
 
 
 def curves_of(learner: str, runs: Sequence[Curve]) -> list[Line]:
-    """Draw each seed from its own start, and the median, for which a seed that has not begun is the lowest."""
-    ends = [each["seconds"][side] for each in runs for side in (0, -1)]
-    shared, colour = np.geomspace(min(ends), max(ends), 400), COLOURS[learner]
-    values = np.median([np.interp(shared, each["seconds"], each["return"], left=-np.inf) for each in runs], axis=0)
-    begun = np.isfinite(values)
-    seeds = [Line(each["seconds"], each["return"], f"{colour}-", width=0.4) for each in runs]
-    return [*seeds, Line(shared[begun], values[begun], f"{colour}-", NAMES[learner], 1.8)]
+    """Draw each seed from its own start (thin), and the median."""
+    style = f"{COLOURS[learner]}-"
+    end = max(float(each["seconds"][-1]) for each in runs)
+    seeds = [Line(each["seconds"], each["return"], style, width=0.4) for each in runs]
+    return [*seeds, Line(*paper.median_curve(runs, "seconds", end), style, NAMES[learner], 1.8)]
 
 
 def panels(machines: Sequence[str]) -> list[Panel]:

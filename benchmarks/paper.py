@@ -154,10 +154,9 @@ def panel(group: Group, found: Mapping[tuple[str, str], list[Curve]], task: str,
         runs = [run for run in found.get((learner, task), []) if not np.isnan(run[x]).any()]
         if not runs:  # or none that had its machine alone, and has seconds
             continue
-        begins.append(max(run[x][0] for run in runs))
+        begins.append(min(run[x][0] for run in runs))
         ends.append(min(run[x][-1] for run in runs))
-        shared = np.geomspace(begins[-1], ends[-1], 400)
-        middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
+        shared, middle = median_curve(runs, x, ends[-1])
         lines += [Line(run[x], run["return"], f"{colour[learner]}-", width=0.5) for run in runs]
         lines.append(Line(shared, middle, f"{colour[learner]}-", NAMES.get(learner, learner), width=2))
     for learner, value in RETURNS[task].published.items():
@@ -167,6 +166,13 @@ def panel(group: Group, found: Mapping[tuple[str, str], list[Curve]], task: str,
     log = "x" if ends and max(ends) > 10 * min(ends) else ""
     text = {"control_steps": "control steps", "seconds": "seconds of training"}[x]
     return Panel(lines, task, text, "return of training episodes" if task == group.tasks[0] else "", log)
+
+
+def median_curve(runs: Sequence[Curve], x: str, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places on x and the median there. A seed that has not begun counts as the lowest."""
+    shared = np.geomspace(min(run[x][0] for run in runs), end, 400)
+    values = np.median([np.interp(shared, run[x], run["return"], left=-np.inf) for run in runs], axis=0)
+    return shared[begun := np.isfinite(values)], values[begun]
 
 
 def pictured(args: Args, name: str) -> None:
@@ -190,7 +196,8 @@ def ratios(args: Args, name: str) -> list[Row]:
             end = min(run["control_steps"][-1] for runs in both for run in runs)
             best = [[float(np.nanmax(run["return"][run["control_steps"] <= end])) for run in runs] for runs in both]
             row: dict[str, object] = {"task": task, "control steps": f"{end / 1e6:.3g} M"}
-            row |= {learner: cells.spread(values) for learner, values in zip((first, second), best, strict=True)}
+            names = (NAMES.get(learner, learner) for learner in (first, second))
+            row |= {name: cells.spread(values) for name, values in zip(names, best, strict=True)}
             rows.append(row | {"ratio": f"{mean(best[0]) / mean(best[1]):.2f}"})
     return rows
 
