@@ -300,6 +300,7 @@ def of_argparse(script: Path) -> set[str]:
 
 ANY = {flag for script in SCRIPTS for flag in flags(script)}
 ANY |= {flag for path in ("commands.py", "tune/__init__.py") for flag in of_commands(ROOT / "diffsim_cli" / path)}
+ANY |= of_commands(ROOT / "examples" / "identify.py")
 ANY |= {f"--{field.name}" for field in dataclasses.fields(view.Args)}
 
 
