@@ -19,7 +19,7 @@ import numpy as np
 import paper
 from cells import RETURNS, Curve
 from common import COLOURS, LEARNT, NAMES, Line, Panel, plot, run
-from tables import Row, grouped, markdown, numbers, read_csv
+from tables import Row, grouped, markdown, numbers, ranged, read_csv
 
 PAGE, README = "benchmarks.md", "../README.md"
 GPUS = "h200", "h100"  # of a learner with results on both the first one counts
@@ -78,7 +78,7 @@ def returns_of_tuned(task: str, form: str = ".0f") -> str:
     """Those of PPO's trials with the entropy bonus that became a task's default."""
     rows = read_csv(common.RESULTS / "h100" / "ppo_trials.csv")
     rows = [row for row in rows if (row["group"], row["cell"]) == (f"{task}, 157 M", TUNED)]
-    return paper.ranged(numbers(rows, "return"), form)
+    return ranged(numbers(rows, "return"), form)
 
 
 def compared() -> Iterator[Row]:
@@ -92,11 +92,11 @@ def compared() -> Iterator[Row]:
             yield {
                 "task": task,
                 "learner": {"rpo": "RPO (our variant)"}.get(learner, learner.partition("_")[0].upper()),
-                "final return": paper.ranged(numbers(own, "return"), ",.0f"),
+                "final return": ranged(numbers(own, "return"), ",.0f"),
                 f"M steps to {target:,}": f"{steps:.2g}",
-                f"s to {target:,}": paper.ranged(numbers(own, f"seconds to {target}"), ".0f"),
-                "whole training (s)": paper.ranged(numbers(own, "training (s)"), ".0f"),
-                "from the command (s)": paper.ranged(numbers(own, "in all (s)"), ".0f"),
+                f"s to {target:,}": ranged(numbers(own, f"seconds to {target}"), ".0f"),
+                "whole training (s)": ranged(numbers(own, "training (s)"), ".0f"),
+                "from the command (s)": ranged(numbers(own, "in all (s)"), ".0f"),
             }
         if tuned := returns_of_tuned(task, ",.0f"):
             yield {"task": task, "learner": "PPO, tuned", "final return": tuned}

@@ -17,7 +17,6 @@ side (--shared): their seconds are then those of pace.csv, of iterations that ha
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +29,7 @@ import fingerprints
 import numpy as np
 from cells import GROUPS, LEARNERS, RETURNS, Cell, Curve, Group, Runner, ScriptFlags, curve, evaluation, read_cells
 from common import LEARNT, NAMES, Line, Panel, Tasks, check_names, colours, plot, run
-from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, read_csv
+from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, ranged, read_csv, tell
 
 import diffsim
 from diffsim.training import Natural, checkpoint
@@ -216,14 +215,6 @@ def line(rows: Sequence[Cells]) -> Row:
     return shown | {"M steps to target": tell(median(steps) / 1e6, ".3g") if steps else ""}
 
 
-def ranged(values: Sequence[float], form: str) -> str:
-    """The median, in brackets the least and the most if they differ; nothing of no values."""
-    if not values:
-        return ""
-    middle, *ends = (tell(value, form) for value in (median(values), min(values), max(values)))
-    return middle if ends[0] == ends[1] else f"{middle} ({ends[0]} to {ends[1]})"
-
-
 def by_task(rows: Sequence[Row]) -> str:
     """A table for each task that has several learners, under its name and target; a single one compares nothing."""
     text = list[str]()
@@ -234,10 +225,6 @@ def by_task(rows: Sequence[Row]) -> str:
         if count > 1:
             text.append(f"**{task}**, target {RETURNS[str(task)].target:,}\n\n{markdown(own, TIMED)}")
     return "\n".join(text) or "(none yet)\n"
-
-
-def tell(value: float, form: str) -> str:
-    return "never" if value == math.inf else f"{value:{form}}"
 
 
 def table(args: Args, name: str) -> list[Row]:

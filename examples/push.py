@@ -1,6 +1,6 @@
 """A task with an object: a ball on two slides pushes a box to a place. docs/own_robot.md explains it.
 
-    python ppo_baseline.py --env examples/push.py --iterations 150
+    python ppo_baseline.py --env examples/push.py --iterations 200
 
 PPO solves it. The learners that use the gradient do not: while nothing touches, and while a force is too small to slide
 the box, the box does not depend on the action.
