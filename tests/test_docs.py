@@ -11,6 +11,7 @@ import importlib
 import json
 import re
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import mean, median, pstdev
@@ -268,6 +269,30 @@ def test_what_is_where_names_all_scripts_and_packages_once() -> None:
 def test_readme_links_the_page_of_every_learner() -> None:
     links = dict(re.findall(r"\[(\w+)\]\(docs/(\w+)\.md\)", README.read_text()))
     assert all(path.stem.startswith(links[path.stem]) for path in LEARNERS)
+
+
+@each_page
+def test_formulas_are_safe_from_markdown(page: Path) -> None:
+    """GitHub drops a backslash before punctuation, except in $`...`$ and in blocks."""
+    text = re.sub(r"`[^`\n]*`", "", FENCE.sub("", page.read_text()))
+    assert not [each for each in re.findall(r"\$([^$\n]+)\$", text) if re.search(r"\\[^\w\s]", each)]
+    assert "$$" not in text
+
+
+def test_the_site_builds(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason='pip install -e ".[docs]"')
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "<math" in (tmp_path / "physics" / "index.html").read_text()
+
+
+def test_the_site_has_all_pages() -> None:
+    text = (ROOT / "mkdocs.yml").read_text()
+    assert {path.name for path in (ROOT / "docs").glob("*.md")} <= {*re.findall(r"\w+\.md", text)}
+    assert all(
+        f"]({path.name})" in (ROOT / "docs" / "index.md").read_text() for path in PAGES[3:] if path.stem != "index"
+    )
 
 
 # Flags ----------------------------------------------------------------------------------------------------------------
