@@ -295,7 +295,7 @@ def label_decades(axis: Any) -> None:
 
     decades = np.log10(np.divide(*axis.get_view_interval()[::-1]))
     if decades < 1:
-        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
     if decades < 3:
         axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
