@@ -267,7 +267,7 @@ def gait(
 
 
 def batch(
-    checkpoint: Positional[Path], count: int = 25, seconds: float = 4.0, size: tuple[int, int] = (640, 360)
+    checkpoint: Positional[Path], count: int = 9, seconds: float = 3.0, size: tuple[int, int] = (640, 360)
 ) -> None:
     """A film of many environments of one batch, each at its place of a grid, called <task>_batch.webp.
 
@@ -294,7 +294,7 @@ def batch(
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     model.vis.map.shadowclip *= side  # the light sees all of them
     data, option, pert, camera = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.95 * side * spacing
+    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.8 * side * spacing
     frames = []
     with mujoco.Renderer(model, size[1], size[0], max_geom=model.ngeom * count + 100) as renderer:
         for moment in rows.swapaxes(0, 1):
