@@ -285,9 +285,7 @@ def batch(
         [episodes.episode(k)[0][round(1 / dt) :: every][: round(seconds / dt / every)] for k in range(count)]
     )
     spacing = SPACING
-    while (
-        nearest(placed := apart(rows, side, spacing)) < NEAR
-    ):  # worlds are independent
+    while nearest(placed := apart(rows, side, spacing)) < NEAR:  # worlds are independent
         spacing += 0.25
     rows = placed
     model, _ = drawable(episodes.scene)
