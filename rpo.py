@@ -49,6 +49,7 @@ INTEGRATION = {"ant": Integration("soft", 8, implicit=True)}  # SAPO's cheaper s
 INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), Integration("soft", 16, implicit=True))
 # On MuJoCo's contact, whose gradients agree over few steps, with four times the environments (docs/transfer.md).
 MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}
+ONSET = {"half_cheetah": {"onset": (0.02, 0.005), "horizon": 16, "adjoint_clip": 3.0}}  # soft first
 # fmt: on
 GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
 CRITIC_MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
@@ -101,7 +102,7 @@ class Args(Flags):
         if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
             _, values["substeps"], values["implicit"], *_ = INTEGRATION[self.task]
         if self.contact == "mujoco":
-            values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
+            values |= MUJOCO | ONSET.get(self.task, {}) | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
         return values
 
 

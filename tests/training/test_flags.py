@@ -249,6 +249,15 @@ def test_defaults_are_the_tables(script, device):
         assert {name: getattr(args, name) for name in expected} == expected
 
 
+def test_contacts_begin_softly_where_that_was_better():
+    args = parse(rpo.Args, "--env half_cheetah --contact mujoco --device cuda".split())
+    assert (args.onset, args.horizon, args.adjoint_clip, args.num_envs) == ((0.02, 0.005), 16, 3.0, 1024)
+    args = parse(rpo.Args, "--env half_cheetah --contact mujoco --onset 0 0 --horizon 8 --device cpu".split())
+    assert (args.onset, args.horizon, args.num_envs) == ((0.0, 0.0), 8, 256)
+    for words in ("--env half_cheetah", "--env ant --contact mujoco"):
+        assert parse(rpo.Args, words.split()).onset == (0.0, 0.0)
+
+
 NEAR = {"adjoint_clip": 5.0, "symmetric": True}  # its standing pose, which is symmetric
 SMALL_CRITIC, LARGE_CRITIC = ({"critic_hidden": hidden, "critic_lr": 1e-3} for hidden in ((256, 128), (512, 256)))
 
