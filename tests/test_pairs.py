@@ -18,8 +18,9 @@ from test_gradient import gradients, weights
 
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constraint import constrained
-from diffsim.robot.pairs import as_primitives, with_pairs
+from diffsim.robot.pairs import with_pairs
 from diffsim.robot.scene import FACTORS, SceneError
+from diffsim.robot.shapes import as_primitives
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim_cli.report import approximations, report

@@ -21,7 +21,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -309,7 +309,7 @@ def batch(
     print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
 
 
-def apart(rows: NDArray[np.float64], side: int, spacing: float) -> NDArray[np.float64]:
+def apart(rows: NDArray[Any], side: int, spacing: float) -> NDArray[Any]:
     """Episodes qpos (n, T, nq), moved so that each starts at its place of a grid."""
     spread = spacing * (np.arange(side) - (side - 1) / 2)
     places = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2)
@@ -318,7 +318,7 @@ def apart(rows: NDArray[np.float64], side: int, spacing: float) -> NDArray[np.fl
     return moved
 
 
-def nearest(rows: NDArray[np.float64]) -> float:
+def nearest(rows: NDArray[Any]) -> float:
     """The least distance [m] between the roots of two robots at the same time."""
     x = rows[:, :, :2].swapaxes(0, 1)
     gaps = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
