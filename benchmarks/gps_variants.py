@@ -22,8 +22,9 @@ from torch import Tensor
 
 from diffsim import DiffEnv
 from diffsim.planning import REAL, System
-from diffsim.robot.scene import Array, Scene
-from diffsim.robot.terrain import TerrainError
+from diffsim.robot.profile import TerrainError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 from diffsim.sim.elevation import Elevation
 from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import Evaluation

@@ -56,14 +56,13 @@ def track(saved: SavedPolicy, task: Tracking, world: OtherFile, args: Args) -> t
 
     push = pushes(args.push, task.control_dt, drawn)
     start = State(qpos, qvel, torch.zeros(n, task.joints).double(), memory)
-    names, sizes = zip(*task.obs_parts, strict=True)
     sums, counted, alive = torch.zeros(3, n).double(), torch.zeros(n), torch.ones(n, dtype=torch.bool)
     for step, seen in enumerate(rollout(world, task, saved.network, start, int(length.max()), push)):
         playing = step < length
         alive &= ~seen.fallen | ~playing
         if not (alive & playing).any():
             break
-        obs = dict(zip(names, seen.obs.split(sizes, -1), strict=True))
+        obs = task.named(seen.obs)
         off = *(obs[name].norm(dim=-1) for name in ("root_off", "root_turned")), obs["joints_off"].abs().mean(-1)
         sums += torch.where(alive & playing, torch.stack(off), 0.0)
         counted += alive & playing

@@ -22,12 +22,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffsim.kernels import parameters as columns
-from diffsim.robot.constraint import LEAST_FRICTION, LEAST_WEIGHT, constrained
-from diffsim.robot.contact import declared_pairs, ground_pairs, pair_law
+from diffsim.kernels.thread.columns import LINK, Columns
+from diffsim.robot.constants import LEAST_FRICTION, LEAST_WEIGHT, constrained
+from diffsim.robot.contacts import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Scene, SceneError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
@@ -53,7 +54,7 @@ UNSUPPORTED |= {"site": "actuators at sites"}
 
 
 class _Robot:
-    """Reads and writes the parameters of an MjModel, and maps them to the columns of kernels/parameters.py.
+    """Reads and writes the parameters of an MjModel, and maps them to the columns of kernels/thread/columns.py.
 
     Attributes:
         file: the file's parameters, in float64.
@@ -167,18 +168,20 @@ class _Robot:
         nlink, mass, drive = self.scene.nlink, values["mass"][self.bodies, None], values["gain"]
         at, inertia = self._about(self.turn, self.place, values)
         ten = torch.cat((mass, mass * at, inertia[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]), 1)
-        links = ten.new_zeros(nlink, columns.LINK).index_add(0, self.link, ten)
-        none = 0 * values["armature"], links[:0, :2]
-        weight, constraints = self._constraints(values) if self.hard else none
+        links = ten.new_zeros(nlink, LINK).index_add(0, self.link, ten)
+        none = 0 * values["armature"], links[:0, :2], links[:0, :2]
+        weight, ground, pairs = self._constraints(values) if self.hard else none
         of_dofs = torch.stack((values["armature"], values["damping"], values["frictionloss"], weight))[:, self.first :]
         servo = torch.stack(
             (self.stiffness_of_gain * drive, self.damping_of_gain * drive + self.damping_of_kv * values["kv"])
         )
         of_servos = ten.new_zeros(2, nlink).index_add(1, self.motor_link, servo)[:, 1:]
         joints = torch.nn.functional.pad(torch.cat((of_dofs, of_servos)), (1, 0)).mT
-        return torch.cat([x.flatten() for x in (links, joints, self.gear * drive[:, None], constraints)])
+        motors = self.gear * drive[:, None]
+        groups = {"links": links, "joints": joints, "motors": motors, "ground": ground, "pairs": pairs}
+        return torch.cat([groups[name].flatten() for name in Columns._fields if name != "end"])
 
-    def _constraints(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _constraints(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the logarithms of MuJoCo's inverse weights of degrees of freedom, and the columns of contacts with the
         ground and of rows between bodies."""
         mass, (turning, moving) = values["mass"][self.bodies, None, None], self.jacobian.unbind(1)
@@ -197,7 +200,8 @@ class _Robot:
         rough = values["friction"][self.friction_geoms].amax(1).clamp(min=LEAST_FRICTION) * self.has_friction
         ground, between = rough.split((len(self.contact_body), len(self.touching)))
         friction = torch.cat((ground, ground.new_zeros(self.equalities), between))
-        return of_dofs.log(), torch.stack((friction, weights.log()), 1)
+        columns = torch.stack((friction, weights.log()), 1).split((len(self.contact_body), len(self.sums)))
+        return of_dofs.log(), *columns
 
     def model(self, values: dict[str, Tensor]) -> mujoco.MjModel:
         """Return a copy of the file's model with these parameters."""

@@ -21,7 +21,7 @@ import warp as wp
 from tyro.conf import Positional
 
 from diffsim import TASKS, SceneError, load_scene, startup
-from diffsim.robot.constraint import check_soft, constrained
+from diffsim.robot.constants import check_soft, constrained
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Contact, base_name, find_task
 from diffsim.training import command, evaluate, fail, load_policy

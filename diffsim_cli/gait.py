@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.scene import Array, Index, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array, Index
 from diffsim.training.evaluation import Evaluation
 from diffsim.training.log import say
 

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from diffsim.robot.scene import Array
+from diffsim.robot.types import Array
 
 MOST_SEGMENTS = 10_000  # of rough ground
 STEEPEST = 45.0  # degrees, of uneven ground that robots are put on

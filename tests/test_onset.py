@@ -26,7 +26,7 @@ from test_pairs import (
 import diffsim
 import shac
 from diffsim.parameters import ParametricSimulator
-from diffsim.robot.constraint import constrained, soften
+from diffsim.robot.constants import constrained, soften
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.training import Evaluation, evaluation, graph, load_policy

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
+from diffsim.robot.contacts import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
-from diffsim.robot.scene import Array, Index, Scene, SceneError
+from diffsim.robot.scene import Scene
 from diffsim.robot.shapes import as_primitives, is_exact, obstacle_geoms
+from diffsim.robot.types import Array, Index, SceneError
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
 Touch = Callable[[int, int], Array]  # two geoms
@@ -24,7 +25,7 @@ _Geom = mujoco.mjtGeom
 PARALLEL, SEGMENTS, BALL_BOX, CAPSULE_BOX, BOXES = range(-1, 4)
 CONTACTS = {PARALLEL: 2, SEGMENTS: 1, BALL_BOX: 1, CAPSULE_BOX: 2, BOXES: 8}  # at most, of a pair
 KINDS = {
-    (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CAPSULE): PARALLEL,  # SEGMENTS if they are not parallel
+    (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CAPSULE): PARALLEL,  # SEGMENTS if they are not parallel, see first_poses
     (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_BOX): BALL_BOX,
     (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_BOX): CAPSULE_BOX,
     (_Geom.mjGEOM_BOX, _Geom.mjGEOM_BOX): BOXES,
@@ -113,6 +114,7 @@ class _Rows:
         self.scene, self.m, self.data = scene, scene.mj_model, at_rest(scene.mj_model)
         shapes = as_primitives(self.m) if scene.geom_pairs else self.m
         self.shapes = shapes, at_rest(shapes)
+        self.axes = [data.geom_xmat[:, 2::3] for data in first_poses(shapes)]  # z of each geom
         self.links = list[tuple[Array, Array]]()  # pose of each link at the reference configuration
         for k in range(scene.nlink):
             rotation, position = self.links[scene.parent[k]] if k else (np.eye(3), np.zeros(3))
@@ -153,7 +155,7 @@ class _Rows:
         turns, (first, second) = data.geom_xmat[geoms].reshape(2, 3, 3), (_Geom(kind) for kind in m.geom_type[geoms])
         ends = list(map(self.frame, m.geom_bodyid[geoms].tolist(), data.geom_xpos[geoms], turns))
         touch = KINDS.get((first, second), SEGMENTS)
-        if touch == PARALLEL and np.linalg.norm(np.cross(*turns[:, :, 2])) > STRAIGHT:
+        if touch == PARALLEL and min(np.linalg.norm(np.cross(*z[geoms])) for z in self.axes) > STRAIGHT:
             touch = SEGMENTS
         size = np.where(m.geom_type[geoms, None] == _Geom.mjGEOM_SPHERE, [1, 0, 0], 1) * m.geom_size[geoms]
         reach = max(params[10] + m.geom_rbound[geoms].sum(), 0.0)
@@ -258,6 +260,16 @@ def _with(scene: Scene, candidates: list[tuple[int, int]]) -> Scene:
         if not overlaps and not {m.geom_type[a], m.geom_type[b]} & set(UNBOUNDED):
             pairs.append((a, b))
     return dataclasses.replace(scene, geom_pairs=tuple(pairs))
+
+
+def first_poses(m: mujoco.MjModel) -> Iterator[mujoco.MjData]:
+    """Compute MuJoCo's kinematics of the reference pose and of each keyframe."""
+    for key in range(-1, m.nkey):
+        data = mujoco.MjData(m)
+        if key >= 0:
+            mujoco.mj_resetDataKeyframe(m, data, key)
+        mujoco.mj_kinematics(m, data)
+        yield data
 
 
 def touching_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:

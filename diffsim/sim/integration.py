@@ -22,7 +22,7 @@ class Integration(NamedTuple):
         substeps: integration steps per control step.
         implicit: only "soft": damping and friction act at the end of a substep. Otherwise it is semi-implicit Euler.
         tolerance: only "mujoco": residual that ends Newton's method, see Simulator.residual.
-        onset: only "mujoco": length [m] over which a contact begins, see robot.constraint.soften; 0: as in the file.
+        onset: only "mujoco": length [m] over which a contact begins, see robot.constants.soften; 0: as in the file.
 
     Raises:
         ValueError: by the simulator that gets it, of an option that it cannot have.

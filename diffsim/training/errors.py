@@ -13,8 +13,8 @@ from typing import NoReturn
 import torch
 
 from diffsim.env import ActionError
-from diffsim.robot.scene import SceneError
-from diffsim.robot.terrain import TerrainError
+from diffsim.robot.profile import TerrainError
+from diffsim.robot.types import SceneError
 from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError
 from diffsim.tasks import TaskError

@@ -38,9 +38,14 @@ def box_contacts(U: type) -> SimpleNamespace:
     """Make the functions for numbers of this type."""
     t, spheres = geom_types(U), sphere_contacts(U)
     vec2, vec3, vec4, mat3, Geom, Touch, Touches = t.vec2, t.vec3, t.vec4, t.mat3, t.Geom, t.Touch, t.Touches
-    sign, column, nearest = spheres.sign, spheres.column, spheres.nearest
+    column, nearest = spheres.column, spheres.nearest
     single = int(U == wp.float32)
     axis_sq, slack, same_sq, skew, rounding = (each[single] for each in (AXIS_SQ, SLACK, SAME_SQ, SKEW, ROUNDING))
+
+    @wp.func
+    def extent(size: vec3, n: vec3):
+        """Return how far a box reaches from its centre along n, an axis in its frame."""
+        return wp.dot(size, wp.abs(n))
 
     @wp.func
     def separating_axis(one: Geom, other: Geom, margin: U):
@@ -49,32 +54,28 @@ def box_contacts(U: type) -> SimpleNamespace:
         Returns:
             its number: i or 3 + i of a face normal to axis i of the first box or of the second, 6 + 3 i + j of edges
             along axis i of the first and j of the second, APART if the boxes are farther from each other than the
-            margin; and that axis, in the world.
+            margin; and the axis of edges in the world, towards the second box.
         """
         Q = wp.transpose(one.R) * other.R
         d = wp.transpose(one.R) * (other.x - one.x)
-        reach = margin + U(slack) * (
-            one.size[0] + one.size[1] + one.size[2] + other.size[0] + other.size[1] + other.size[2]
-        )
+        d2 = wp.transpose(other.R) * (other.x - one.x)
+        ones = vec3(U(1.0), U(1.0), U(1.0))
+        reach = margin + U(slack) * (wp.dot(one.size, ones) + wp.dot(other.size, ones))
         number = int(APART)
-        normal = vec3()
         best = U(-1e30)
         for k in range(6):
-            n = vec3()
-            if k < 3:
-                n[k] = U(1.0)
-            else:
-                n = column(Q, k - 3)
-            gap = wp.abs(wp.dot(n, d)) - wp.dot(one.size, wp.abs(n)) - wp.dot(other.size, wp.abs(wp.transpose(Q) * n))
+            i = k % 3
+            gap = wp.abs(d[i]) - one.size[i] - extent(other.size, Q[i])
+            if k > 2:
+                gap = wp.abs(d2[i]) - other.size[i] - extent(one.size, column(Q, i))
             if gap > reach:
-                return APART, normal
+                return APART, d
             if gap > best:
                 best = gap
                 number = k
-                normal = n
         face = best
         face_number = number
-        face_normal = normal
+        axis = vec3()
         for k in range(9):
             e = vec3()
             e[k // 3] = U(1.0)
@@ -82,122 +83,119 @@ def box_contacts(U: type) -> SimpleNamespace:
             square = wp.dot(n, n)
             if square > U(axis_sq):
                 n = n / wp.sqrt(square)
-                gap = (
-                    wp.abs(wp.dot(n, d)) - wp.dot(one.size, wp.abs(n)) - wp.dot(other.size, wp.abs(wp.transpose(Q) * n))
-                )
+                gap = wp.abs(wp.dot(n, d)) - extent(one.size, n) - extent(other.size, wp.transpose(Q) * n)
                 if gap > reach:
-                    return APART, normal
+                    return APART, d
                 if gap > face and gap - U(EDGE_BIAS) * wp.abs(gap) > best:
                     best = gap
                     number = EDGES + k
-                    normal = n
-        if wp.abs(wp.dot(normal, face_normal)) > U(ALIAS):
-            if best < face + U(ALIAS_BIAS) * wp.abs(face) + U(TINY):
-                number = face_number
-                normal = face_normal
-        return number, sign(wp.dot(normal, d)) * (one.R * normal)
+                    axis = n
+        normal = vec3()
+        if face_number < 3:
+            normal[face_number] = U(1.0)
+        else:
+            normal = column(Q, face_number - 3)
+        if wp.abs(wp.dot(axis, normal)) > U(ALIAS) and best < face + U(ALIAS_BIAS) * wp.abs(face) + U(TINY):
+            number = face_number
+        return number, wp.sign(wp.dot(axis, d)) * (one.R * axis)
 
     @wp.func
-    def append(count: int, corner: Touch, same: U, found: Touches):
+    def append(count: int, z: vec3, a: vec3, b: vec3, kept: U, same: U, found: Touches):
         """Append a corner unless one that is listed has its place; returns their number."""
         for k in range(count):
-            gap = found[k].z - corner.z
+            gap = found[k].z - z
             if gap[0] * gap[0] + gap[1] * gap[1] < same:
                 return count
         if count == CORNERS:
             return count
-        found[count] = corner
+        found[count].z = z
+        found[count].a = a
+        found[count].b = b
+        found[count].how = vec4(U(0.0), U(0.0), kept, U(0.0))
         return count + 1
 
     @wp.func
+    def corner(centre: vec3, du: vec3, dv: vec3, k: int):
+        """Return corner k of a parallelogram with the half edges du, dv, one after the other around it."""
+        return centre + U(1.0 - 2.0 * float((k + 1) // 2 % 2)) * du + U(1.0 - 2.0 * float(k // 2 % 2)) * dv
+
+    @wp.func
     def clip(centre: vec3, du: vec3, dv: vec3, half: vec2, found: Touches):
-        """Clip the parallelogram of half edges du, dv to the rectangle |x|, |y| < half; returns how many corners."""
+        """Clip the parallelogram of half edges du, dv to the rectangle |x|, |y| <= half; returns how many corners."""
         same = U(same_sq) * wp.dot(half, half)
         count = int(0)
-        D = U(-2.0) * du
-        next_D = U(-2.0) * dv
-        p = centre + du + dv
-        for _ in range(4):
-            # the part of this edge that is inside, from t0 to t1, and the sides at its ends
-            t0 = U(0.0)
-            t1 = U(1.0)
-            start = Touch()
-            end = Touch()
-            for i in range(2):
-                inv = sign(D[i]) / wp.max(wp.abs(D[i]), U(1e-20))
-                enter = inv * (-sign(D[i]) * half[i] - p[i])
-                leave = inv * (sign(D[i]) * half[i] - p[i])
-                side = vec3()
-                if wp.abs(D[i]) > U(skew) * wp.length(D):
-                    side[i] = -inv
-                if enter > t0:
-                    t0 = enter
-                    start.a = side
-                if leave < t1:
-                    t1 = leave
-                    end.a = side
-            if t0 < t1:
-                start.z = p + t0 * D
-                start.b = D
-                start.how[2] = U(1.0)
-                count = append(count, start, same, found)
-                if t1 < U(1.0):
-                    end.z = p + t1 * D
-                    end.b = D
-                    end.how[2] = U(1.0)
-                    count = append(count, end, same, found)
-            p = p + D
-            turned = next_D
-            next_D = -D
-            D = turned
-        w = wp.cross(du, dv)
-        inv_area = U(1.0) / w[2]
         for k in range(4):
-            r = vec3(half[0] * U(1.0 - 2.0 * float(k % 2)), half[1] * U(1.0 - 2.0 * float(k // 2)), U(0.0)) - centre
-            alpha = (r[0] * dv[1] - r[1] * dv[0]) * inv_area
-            beta = (du[0] * r[1] - du[1] * r[0]) * inv_area
+            # this edge from p to q, and the sides where it was cut
+            p = corner(centre, du, dv, k)
+            q = corner(centre, du, dv, k + 1)
+            D = q - p
+            m_p = vec3()
+            m_q = vec3()
+            outside = int(0)
+            for side in range(4):
+                i = side // 2
+                e = U(1.0 - 2.0 * float(side % 2))
+                p_out = e * p[i] - half[i]
+                q_out = e * q[i] - half[i]
+                m = vec3()
+                if wp.abs(D[i]) > U(skew) * wp.length(D):
+                    m[i] = U(-1.0) / D[i]
+                if p_out > U(0.0) and q_out > U(0.0):
+                    outside = 1
+                elif p_out > U(0.0):
+                    p = p + (p_out / (p_out - q_out)) * (q - p)
+                    m_p = m
+                elif q_out > U(0.0):
+                    q = p + (p_out / (p_out - q_out)) * (q - p)
+                    m_q = m
+            if outside == 0:
+                count = append(count, p, m_p, D, U(1.0), same, found)
+                count = append(count, q, m_q, D, U(1.0), same, found)
+        w = wp.cross(du, dv)
+        w = w / w[2]
+        up = vec3(U(0.0), U(0.0), U(1.0))
+        inv_u = wp.cross(dv, up) / wp.dot(wp.cross(dv, up), du)
+        inv_v = wp.cross(du, up) / wp.dot(wp.cross(du, up), dv)
+        for k in range(4):
+            r = corner(vec3(), vec3(half[0], U(0.0), U(0.0)), vec3(U(0.0), half[1], U(0.0)), k) - centre
+            alpha = wp.dot(inv_u, r)
+            beta = wp.dot(inv_v, r)
             # of equal faces on each other, edges may be outside by rounding: then these corners are left
             if wp.max(wp.abs(alpha), wp.abs(beta)) < U(1.0) + U(rounding):
-                corner = Touch()
-                corner.z = centre + alpha * du + beta * dv
-                corner.a = inv_area * w
-                corner.b = vec3(U(0.0), U(0.0), U(1.0))
-                count = append(count, corner, same, found)
+                count = append(count, centre + alpha * du + beta * dv, w, up, U(0.0), same, found)
         return count
 
     @wp.func
-    def face_contacts(ref: Geom, inc: Geom, axis: int, N: vec3, found: Touches):
-        """Find the corners of the box inc on the face of the box ref with this axis and the normal N, which is outward.
+    def face_contacts(ref: Geom, inc: Geom, axis: int, side: U, found: Touches):
+        """Find the corners of the box inc on the face of the box ref with this axis; returns their number.
 
-        Returns their number; their normal is N.
+        The normal is the face's own, outward, or minus that: side is 1 if ref is the first box, else -1.
         """
         x = (axis + 1) % 3
         y = (axis + 2) % 3
-        X = column(ref.R, x)
-        Y = column(ref.R, y)
-        frame = wp.matrix_from_rows(X, Y, N)
+        N = column(ref.R, axis)
+        N = wp.sign(wp.dot(N, inc.x - ref.x)) * N
+        back = wp.matrix_from_cols(column(ref.R, x), column(ref.R, y), N)
         # the face of the other box that opposes this one most
-        facing = wp.transpose(inc.R) * N
-        g = int(0)
-        for k in range(1, 3):
-            if wp.abs(facing[k]) > wp.abs(facing[g]):
-                g = k
+        R = wp.transpose(back) * inc.R
+        facing = R[2]
+        g = int(wp.argmax(wp.abs(facing)))
         u = (g + 1) % 3
         v = (g + 2) % 3
-        centre = frame * (inc.x - ref.x - sign(facing[g]) * inc.size[g] * column(inc.R, g))
+        centre = wp.transpose(back) * (inc.x - ref.x) - wp.sign(facing[g]) * inc.size[g] * column(R, g)
         centre[2] = centre[2] - ref.size[axis]
-        du = inc.size[u] * (frame * column(inc.R, u))
-        dv = inc.size[v] * (frame * column(inc.R, v))
+        du = inc.size[u] * column(R, u)
+        dv = inc.size[v] * column(R, v)
         count = clip(centre, du, dv, vec2(ref.size[x], ref.size[y]), found)
-        back = wp.transpose(frame)
         for k in range(count):
             dist = found[k].z[2]
             found[k].dist = dist
             found[k].z = ref.x + ref.size[axis] * N + back * found[k].z
             found[k].p = found[k].z - U(0.5) * dist * N
-            found[k].n = N
+            found[k].n = side * N
             found[k].a = back * found[k].a
             found[k].b = back * found[k].b
+            found[k].how[1] = wp.max(side, U(0.0))
         return count
 
     @wp.func
@@ -205,7 +203,7 @@ def box_contacts(U: type) -> SimpleNamespace:
         """Return the middle of the edge along that axis which is farthest in the direction n, from a box's centre."""
         corner = wp.transpose(R) * n
         for k in range(3):
-            corner[k] = sign(corner[k]) * h[k]
+            corner[k] = wp.sign(corner[k]) * h[k]
         corner[axis] = U(0.0)
         return R * corner
 
@@ -238,13 +236,7 @@ def box_contacts(U: type) -> SimpleNamespace:
             found[0] = edge_contact(one, other, (number - EDGES) // 3, (number - EDGES) % 3, n)
             return 1
         if number < 3:
-            count = face_contacts(one, other, number, n, found)
-            for k in range(count):
-                found[k].how[1] = U(1.0)
-            return count
-        count = face_contacts(other, one, number - 3, -n, found)
-        for k in range(count):
-            found[k].n = n
-        return count
+            return face_contacts(one, other, number, U(1.0), found)
+        return face_contacts(other, one, number - 3, U(-1.0), found)
 
     return functions(locals())

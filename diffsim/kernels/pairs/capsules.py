@@ -26,7 +26,7 @@ WHOLE, SIDE = 1, 2  # a way along an axis of the box is at most as long as the b
 def capsule_contacts(U: type) -> SimpleNamespace:
     """Make the functions for numbers of this type."""
     t, spheres = geom_types(U), sphere_contacts(U)
-    vec3, Geom, Touches, sign = t.vec3, t.Geom, t.Touches, spheres.sign
+    vec3, Geom, Touches = t.vec3, t.Geom, t.Touches
     same_sq, skew_sq = (each[int(U == wp.float32)] for each in (SAME_SQ, SKEW_SQ))
     Feature = struct(
         "Feature",
@@ -64,35 +64,53 @@ def capsule_contacts(U: type) -> SimpleNamespace:
                 feature.s = end
         hh = wp.dot(h, h)
         for j in range(3):
+            low = int(0)  # the first of the two other axes: of equally near edges MuJoCo has the first in this order
+            if j == 0:
+                low = 1
             along = vec3()
             along[j] = b[j]
-            det = b[j] * b[j] * (hh - h[j] * h[j])
+            det = b[j] * b[j] * hh - b[j] * h[j] * (b[j] * h[j])
             skew = det > wp.max(U(TINY), U(skew_sq) * b[j] * b[j] * hh)
             for k in range(4):
                 middle = b - along
-                middle[(j + 1) % 3] = b[(j + 1) % 3] * U(1.0 - 2.0 * float(k % 2))
-                middle[(j + 2) % 3] = b[(j + 2) % 3] * U(1.0 - 2.0 * float(k // 2))
+                if k % 2 == 0:
+                    middle[low] = -b[low]
+                if k < 2:
+                    middle[3 - j - low] = -b[3 - j - low]
                 # the axis is at least as far from this edge as the box around it
+                gap = middle - y
                 bound = U(0.0)
                 for i in range(3):
-                    gap = wp.max(wp.abs(middle[i] - y[i]) - wp.abs(h[i]) - along[i], U(0.0))
-                    bound = bound + gap * gap
+                    beyond = wp.max(wp.abs(gap[i]) - wp.abs(h[i]) - along[i], U(0.0))
+                    bound = bound + beyond * beyond
                 if skew and bound < best - U(same_sq):
-                    at, s, d = spheres.nearest(middle, along, y, h)
+                    # nearest points middle + at along and y + s h; it is a corner, too, if both lines' are beyond it
+                    u = -b[j] * gap[j]
+                    v = wp.dot(h, gap)
+                    at = (hh * u + b[j] * h[j] * v) / det
+                    s = (b[j] * b[j] * v + b[j] * h[j] * u) / det
+                    kind = int(EDGE)
+                    side = at
+                    if wp.abs(at) > U(1.0):
+                        kind = int(CORNER)
+                        at = wp.sign(at)
+                        s = (v + at * b[j] * h[j]) / hh
+                    if wp.abs(s) > U(1.0):
+                        s = wp.sign(s)
+                        at = (u + s * b[j] * h[j]) / (b[j] * b[j])
+                        if wp.abs(at) > U(1.0):
+                            kind = int(CORNER)
+                            side = at
+                            at = wp.sign(at)
+                    d = gap + at * along - s * h
                     if wp.dot(d, d) < best - U(same_sq):
                         best = wp.dot(d, d)
-                        feature.kind = CORNER
+                        feature.kind = kind
                         feature.axis = j
                         feature.s = s
                         feature.point = middle + at * along
                         feature.corner = middle
-                        feature.corner[j] = at
-                        if wp.abs(at) < U(1.0):
-                            # MuJoCo counts a point as a corner, too, if the nearest points of both lines are beyond it
-                            line = b[j] * (hh * (y[j] - middle[j]) - h[j] * wp.dot(h, y - middle))
-                            feature.corner[j] = line
-                            if wp.abs(line) < det:
-                                feature.kind = EDGE
+                        feature.corner[j] = side
         return feature
 
     @wp.func
@@ -163,7 +181,7 @@ def capsule_contacts(U: type) -> SimpleNamespace:
         length = U(1.0) - way * first.s
         q = y + first.s * h
         for i in range(3):
-            inv_h = sign(h[i]) / wp.max(wp.abs(h[i]), U(TINY))
+            inv_h = wp.sign(h[i]) / wp.max(wp.abs(h[i]), U(TINY))
             if ends[i] == WHOLE:
                 step = U(2.0) * b[i] * wp.abs(inv_h)
                 if step < length:
@@ -172,8 +190,8 @@ def capsule_contacts(U: type) -> SimpleNamespace:
                     place.by_h = first.by_h
                     place.by_h[i] = place.by_h[i] - way * step * inv_h
             if ends[i] == SIDE:
-                step = (b[i] - way * sign(h[i]) * q[i]) * wp.abs(inv_h)
-                if step < length:
+                step = (b[i] - way * wp.sign(h[i]) * q[i]) * wp.abs(inv_h)
+                if step > U(0.0) and step < length:  # a capsule that begins at the side goes on along it
                     length = step
                     place.by_y = vec3()
                     place.by_y[i] = -inv_h
@@ -194,7 +212,7 @@ def capsule_contacts(U: type) -> SimpleNamespace:
     def capsule_box(capsule: Geom, box: Geom, margin: U, found: Touches):
         """Find the contacts of a capsule and a box, none if they are clearly apart; returns their number."""
         y = wp.transpose(box.R) * (capsule.x - box.x)
-        h = wp.transpose(box.R) * spheres.half_axis(capsule)
+        h = capsule.size[1] * (wp.transpose(box.R) * spheres.column(capsule.R, 2))
         reach = capsule.size[0] + margin
         for i in range(3):
             if wp.abs(y[i]) - wp.abs(h[i]) - box.size[i] > reach:

@@ -27,13 +27,6 @@ def sphere_contacts(U: type) -> SimpleNamespace:
     parallel_sq, surface = (each[int(U == wp.float32)] for each in (PARALLEL_SQ, SURFACE))
 
     @wp.func
-    def sign(x: U):
-        """Return -1 if x < 0, else 1."""
-        if x < U(0.0):
-            return U(-1.0)
-        return U(1.0)
-
-    @wp.func
     def column(R: mat3, i: int):
         """Return an axis of a frame."""
         return vec3(R[0, i], R[1, i], R[2, i])
@@ -108,7 +101,7 @@ def sphere_contacts(U: type) -> SimpleNamespace:
         d = other.x - one.x
         for k in range(2):
             end = U(2.0 * float(k) - 1.0)  # of the first capsule, or that of the second one which lies before it
-            facing = end * sign(mb)
+            facing = end * wp.sign(mb)
             s1 = (wp.dot(a1, d) + facing * mb) / ma
             s2 = facing
             if end * s1 >= U(1.0):
@@ -127,8 +120,8 @@ def sphere_contacts(U: type) -> SimpleNamespace:
         d = vec3()
         free = vec3(U(1.0), U(1.0), U(1.0))
         for i in range(3):
-            if wp.abs(y[i]) >= box.size[i]:
-                d[i] = sign(y[i]) * box.size[i] - y[i]
+            if wp.abs(y[i]) > box.size[i]:
+                d[i] = wp.sign(y[i]) * box.size[i] - y[i]
                 free[i] = U(0.0)
         length = wp.length(d)
         touch = Touch()
