@@ -31,6 +31,16 @@ State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 class Simulator:
     """A batch of independent copies of one scene, stepped by control steps of equal length.
 
+    Example:
+        scene = diffsim.load_scene("robot.xml")
+        sim = diffsim.Simulator(scene, 16, diffsim.Integration("mujoco", 8), control_dt=0.02, horizon=2)
+        qpos, qvel = torch.tensor(scene.qpos0).float().repeat(16, 1), torch.zeros(16, scene.nv)
+        ctrl = torch.zeros(16, scene.nu, requires_grad=True)              # in [-1, 1]
+        for _ in range(2):
+            qpos, qvel = sim.step(qpos, qvel, ctrl)
+        qvel.sum().backward()
+        sim.rewind()                                                      # the next rollout
+
     Up to `horizon` differentiable control steps make a rollout, and `rewind` begins the next one. A backward pass must
     run before the next rollout overwrites its steps, otherwise it raises RuntimeError.
 

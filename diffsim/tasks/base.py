@@ -47,6 +47,21 @@ class Task:
 
     docs/own_robot.md lists the attributes and their defaults. An episode starts uniformly in start +- spread / 2, where
     both list qpos, then qvel.
+
+    Example:
+        class Forward(diffsim.Task):
+            name, asset = "forward", "robot.xml"
+
+            def observe(self, qpos, qvel, action):
+                return torch.cat((qpos[..., 1:], qvel), dim=-1)
+
+            def reward(self, obs, action):
+                return obs[..., 5]                                        # m/s
+
+        env = diffsim.make(Forward, num_envs=4)
+
+    Raises:
+        TaskError: by `make`, of a task that does not fit its robot.
     """
 
     name: ClassVar[str] = "task"
@@ -84,10 +99,24 @@ class Task:
 
     @classmethod
     def load_robot(cls) -> Scene:
-        """Load the robot of the asset.
+        """Load the robot of the asset; override it to change the robot.
+
+        Example:
+            from diffsim.robot.pairs import with_pairs
+
+            class Touching(diffsim.Task):
+                name = "touching"
+
+                @classmethod
+                def load_robot(cls):
+                    return with_pairs(diffsim.load_scene("robot.xml"))    # its parts touch each other
 
         A file of diffsim's tasks is in diffsim/assets. Another task's is searched next to the file of the class that
         names it, in the working directory and in diffsim/assets.
+
+        Raises:
+            TaskError: there is no asset, or no such file.
+            SceneError: the robot cannot be simulated.
         """
         owner = next((kind for kind in cls.__mro__ if "asset" in vars(kind)), cls).__module__
         asset: Asset | None = getattr(cls, "asset", None)
