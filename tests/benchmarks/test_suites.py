@@ -13,7 +13,7 @@ import sapo
 import stages
 import suites
 from common import RESULTS, ROOT
-from gps_variants import VariantArgs
+from guided_policy_search import VariantArgs
 from tables import read_csv
 
 import pfpn
@@ -23,7 +23,7 @@ import shac
 from diffsim.training import parse
 
 SCRIPTS = {
-    "benchmarks/gps_variants": VariantArgs,
+    "benchmarks/guided_policy_search": VariantArgs,
     "benchmarks/stages": stages.Args,
     "mbpo": mbpo.Args,
     "pfpn": pfpn.Args,
