@@ -286,12 +286,11 @@ def terrains(env: str) -> dict[str, list[str]]:
     }
 
 
-def load_search(path: Path) -> gps.Search:
-    """The search of a checkpoint of gps.py or gps_variants.py."""
+def load_search(path: Path) -> Search:
+    """The search of a checkpoint of gps.py or of this script."""
     state = checkpoint.load(path)
-    kind = gps.Args if state["script"] == "gps" else VariantArgs
-    args = kind(**state["args"] | {"device": "cpu"})
-    search: gps.Search = (CASES[args.case] if isinstance(args, VariantArgs) else gps.Search)(args, make_env(args, 1))
+    args = VariantArgs(**state["args"] | {"device": "cpu"})
+    search = CASES[args.case](args, make_env(args, 1))
     checkpoint.restore(search, state)
     return search
 
@@ -349,7 +348,7 @@ def lasts(path: Path) -> Iterator[Row]:
         ends = {steps: walked(search, S.x[:, : steps + 1], finite[:, :steps]) for steps in (T, HORIZONS * T)}
         shares = {f"walked {steps // T}": found.double().mean().item() for steps, found in ends.items()}
         returns = {f"return {k + 1}": S.reward[:, k * T : k * T + T].sum(1).mean().item() for k in range(HORIZONS)}
-        yield about | {"noise": factor, "trajectories": len(noise), "steps": T} | shares | returns
+        yield {**about, "noise": factor, "trajectories": len(noise), "steps": T, **shares, **returns}
 
 
 def walks(path: Path) -> Iterator[Row]:

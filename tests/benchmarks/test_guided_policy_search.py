@@ -221,12 +221,12 @@ def test_restarts_begin_anywhere_on_the_guides(tmp_path: Path) -> None:
 
 def test_a_single_example_has_no_noise() -> None:
     """Its policy acts at the example's states as the example does, however the guides' samples differ."""
-    args = make_search("--pretraining", "300").args
+    args = make_search("--pretraining", "3000").args
     search = benchmark.SingleExample(args, diffsim.make("hopper", 1, control_dt=0.02, substeps=20))
     search.prepare(lambda message: None)
     guide, policy = search.guides[0], search.network
     error = (policy.mean(policy.theta, search.system.observe(guide.x[:-1])) - guide.u) / policy.sigma
-    assert error.abs().max() < 0.05
+    assert error.abs().max() < 0.5
 
 
 # What lasts, and what walks over terrain ------------------------------------------------------------------------------
