@@ -397,26 +397,29 @@ NAMES = {
     "policy-gradient": "policy gradient",
     "dagger": "DAgger",
 }
-MAIN = {"full": "shipped", "ddp": "a plan of iLQR", "loud": "shipped, noise of 10 %"}
+MAIN = {"full": "", "ddp": ", plan of iLQR", "loud": ", noise of 10 %"}  # cells of the table of tasks
 
 
 def tasks(runs: Rows, lasting: Rows) -> list[Row]:
-    """A line for each task and example: lowest to highest returns of the seeds, core seconds, and what walks to 3 T."""
+    """A line for each task and example: lowest to highest returns of the seeds, core seconds, and what lasts."""
     result = list[Row]()
     for (group, cell), own in grouped(runs, "group", "cell").items():
-        if cell not in MAIN:
+        if cell not in MAIN or group == SHORT:
             continue
-        line: dict[str, object] = {"task": group, "example": MAIN[cell], "seeds": len(own)}
-        for name in ("guides", "pretrained", "end"):
-            values = numbers(own, name)
-            line[name] = f"{min(values):.1f} to {max(values):.1f}"
-        line["seconds of a core"] = f"{mean(numbers(own, 'core_seconds')):.0f}"
-        for factor in FACTORS:
-            key = group, cell, str(factor)
-            shares = [
-                float(row[f"walked {HORIZONS}"]) for row in lasting if (row["group"], row["cell"], row["noise"]) == key
+        line: dict[str, object] = {"task": f"{group}{MAIN[cell]}", "seeds": len(own)}
+        for title, name in (("guides", "guides"), ("pretraining alone", "pretrained"), ("search", "end")):
+            low, high = min(numbers(own, name)), max(numbers(own, name))
+            line[title] = f"{low:.1f} to {high:.1f}" if low < high else f"{low:.1f}"
+        line["core seconds"] = f"{mean(numbers(own, 'core_seconds')):.0f}"
+        shares = [
+            [
+                float(row[f"walked {HORIZONS}"])
+                for row in lasting
+                if [row[name] for name in LASTING if name != "seed"] == key
             ]
-            line[f"walks {HORIZONS} T, {factor} x noise"] = f"{mean(shares):.0%}" if shares else ""
+            for key in ([group, cell, str(factor)] for factor in FACTORS)
+        ]
+        line["lasts, noise x 1 / x 3"] = " / ".join(f"{mean(share):.0%}" if share else "" for share in shares)
         result.append(line)
     return result
 

@@ -313,6 +313,19 @@ def test_what_lasts_is_looked_at_for_three_horizons(trained: Path, tmp_path: Pat
     assert not benchmark.walked(search, longer, finite).any()
 
 
+def test_the_table_of_tasks_has_a_line_for_each_example() -> None:
+    runs = [
+        {"group": "hopper", "cell": cell, "guides": "-87", "pretrained": "-120", "end": end, "core_seconds": "80"}
+        for cell, end in (("full", "-90"), ("full", "-88.5"), ("restart", "-1000"), ("ddp", "-99"))
+    ]
+    about = {"group": "hopper", "cell": "full", "seed": "1"}
+    lasting = [about | {"noise": factor, "walked 3": share} for factor, share in (("1", "1"), ("3", "0.25"))]
+    first, second = benchmark.tasks(runs, lasting)
+    assert first["task"] == "hopper" and first["search"] == "-90.0 to -88.5" and first["guides"] == "-87.0"
+    assert first["seeds"] == 2 and first["lasts, noise x 1 / x 3"] == "100% / 25%"
+    assert second["task"] == "hopper, plan of iLQR" and second["search"] == "-99.0"
+
+
 # The picture ----------------------------------------------------------------------------------------------------------
 
 
