@@ -106,7 +106,7 @@ class Args(Flags):
         if self.device != "cpu":
             values |= ON_GPU.get(self.task, {})
         if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
-            _, values["substeps"], values["implicit"], _ = INTEGRATION[self.task]
+            _, values["substeps"], values["implicit"], *_ = INTEGRATION[self.task]
         if self.contact == "mujoco" and self.task not in STANDING:
             values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
         return super().task_defaults() | values | STANDING.get(self.task, {})

@@ -47,6 +47,7 @@ def make(
     substeps: int | None = None,
     implicit: bool | None = None,
     tolerance: float | None = None,
+    onset: float | None = None,
     penalty: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float32,
     terrain: ArrayLike | None = None,
@@ -81,7 +82,7 @@ def make(
             g1, g1_track and tasks of your own, "soft" for the others.
         accuracy: preset of the integration, "fast" (soft contact only), "default" (the papers') or "accurate", see
             docs/numerics.md.
-        substeps, implicit, tolerance: replace parts of the preset, see Integration.
+        substeps, implicit, tolerance, onset: replace parts of the preset, see Integration.
         penalty: constants of the penalty law that replace the MJCF's, e.g. {"k_n": 1e5}, see docs/physics.md.
         dtype: torch.float32 or torch.float64.
         terrain: replaces the task's ground: vertices (x, z) [m] of one profile, (K, 2), or of one for each
@@ -118,7 +119,7 @@ def make(
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
     scene = task.scene()
-    asked: Any = dict(substeps=substeps, implicit=implicit, tolerance=tolerance)
+    asked: Any = dict(substeps=substeps, implicit=implicit, tolerance=tolerance, onset=onset)
     given = {name: value for name, value in asked.items() if value is not None}
     integration = task.integration(accuracy, contact)._replace(**given)
     if penalty and integration.contact == "mujoco":

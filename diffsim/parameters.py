@@ -19,13 +19,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim.kernels import parameters as columns
-from diffsim.kernels.thread.division import divide
-from diffsim.kernels.thread.model import model_of
 from diffsim.robot.constraint import LEAST_FRICTION, LEAST_WEIGHT, constrained
 from diffsim.robot.contact import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos
@@ -290,18 +287,13 @@ class ParametricSimulator(Simulator):
         given = {name: self._robot.check(name, value) for name, value in values.items()}
         new, scene, launcher = load_scene(self._robot.model(self._robot.file | given)), self.scene, self._launcher
         scene = dataclasses.replace(scene, mj_model=new.mj_model, **{name: getattr(new, name) for name in OF_SCENE})
-        if self._robot.hard:
-            seconds = self.control_dt / self.integration.substeps
-            scene = constrained(scene, seconds, self.dtype == torch.float32)
+        scene = self._with_contact(scene, self.integration)
         if changed := scene.features ^ launcher.spec.features:
             raise ValueError(
                 f"parameters: {', '.join(sorted(changed))} must be zero everywhere if and only if it is so in the "
                 "file, because the kernels contain only what the file uses"
             )
-        model = model_of(scene, divide(scene, 1, 1), launcher.spec.dtype, str(self.device))
-        for name in OF_MODEL:
-            if (array := getattr(launcher._model, name, None)) is not None:
-                wp.to_torch(array).copy_(wp.to_torch(getattr(model, name)))
+        launcher.rewrite(scene, OF_MODEL)
         self._versions = [version + 1 for version in self._versions]  # earlier steps have no adjoint any more
         row = self._robot.columns(self._robot.file | given).to(self.device, self.dtype)
         self._given, self._factors = given, row.expand(self.num_envs, -1)

@@ -140,11 +140,11 @@ def enough_passes(monkeypatch):
     monkeypatch.setattr(simulator, "PASSES", PASSES)
 
 
-def step(scene, states, substeps=1, tolerance=TOLERANCE, **options):
+def step(scene, states, substeps=1, tolerance=TOLERANCE, onset=0.0, **options):
     """qpos, qvel and the residual after a control step."""
     options = {"dtype": torch.float64} | options
     factors = options.pop("factors", None)
-    integration, given = Integration("mujoco", substeps, tolerance=tolerance), factors is not None
+    integration, given = Integration("mujoco", substeps, tolerance=tolerance, onset=onset), factors is not None
     sim = Simulator(scene, len(states[0]), integration, substeps * H, factors=given, **options)
     sim.factors = factors if given else sim.factors
     with torch.no_grad():
@@ -371,12 +371,12 @@ def test_a_level_terrain_is_the_plane(rng):
 # Gradients
 
 
-def check_gradients(scene, states, rng, optional=None, enough=0.5):
+def check_gradients(scene, states, rng, optional=None, enough=0.5, onset=0.0):
     """Against differences, in the states where Newton's method has converged, and does in their neighbourhood."""
-    integration, w = Integration("mujoco", 4, tolerance=TOLERANCE), weights(scene, rng)
+    integration, w = Integration("mujoco", 4, tolerance=TOLERANCE, onset=onset), weights(scene, rng)
     given = {name: torch.tensor(x) for name, x in (optional or {}).items()}
     beside = [[x + scale * rng.normal(size=x.shape) for x in states] for scale in (0.0, 1e-7, 1e-6, 1e-5)]
-    residual = np.max([step(scene, near, substeps=4, **given)[2] for near in beside], axis=0)
+    residual = np.max([step(scene, near, substeps=4, onset=onset, **given)[2] for near in beside], axis=0)
     sim = {"integration": integration, "control_dt": 4 * H}
     kept = residual < 1e-10
     assert kept.mean() >= enough

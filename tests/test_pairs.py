@@ -258,13 +258,13 @@ def test_robots_that_touch_themselves_step_as_in_mujoco(base, cone, seeds, rng):
     assert "geoms_rows" in constrained(scene, H).features
 
 
-def check_gradients_of_touching(scene, states, rng):
+def check_gradients_of_touching(scene, states, rng, onset=0.0):
     """Compare gradients with differences in the six calmest states in which something touches."""
     ends, apart = (in_mujoco(scene, *states, substeps=4, model=make(scene))[1] for make in MODELS)
     touches = abs(ends - apart).max(1) > 1e-3
     calm = np.argsort(np.where(touches, abs(ends).max(1), np.inf))[:6]
     assert touches[calm].all()
-    check_gradients(scene, [x[calm] for x in states], rng)
+    check_gradients(scene, [x[calm] for x in states], rng, onset=onset)
 
 
 @pytest.mark.parametrize("base, cone, seeds", TANGLES)

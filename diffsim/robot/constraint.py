@@ -24,6 +24,8 @@ LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
 # MuJoCo's bound of an inverse weight, 0 of a link that turns about its centre of mass; and one for single precision
 LEAST_WEIGHT, LEAST_WEIGHT_SINGLE = 1e-15, 1e-7
 MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precision still holds
+IMPEDANCE = slice(5, 8)  # of a row of constants: the impedance's ends and width
+SOFT = 0.015  # impedance with which a contact of a chosen onset begins, that of Menagerie's Go1 and Go2
 LEAST_SOFTNESS = 1e-6  # of a pyramid's edges, at which Newton's method fails in single precision
 
 
@@ -44,8 +46,10 @@ class Constraints(NamedTuple):
         return bool(self.contact[:, 2].any() or (self.pairs and self.pairs.params[self.pairs.kind == GEOMS, 2].any()))
 
 
-def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
+def constrained(scene: Scene, seconds: float, single: bool = True, onset: float = 0.0) -> Scene:
     """Return a copy with MuJoCo's constraints for that length of a substep, to be solved in single precision or not.
+
+    Contacts begin over a length of `onset` [m], see soften.
 
     Raises:
         SceneError: a constraint is not supported, or too stiff for single precision.
@@ -57,7 +61,7 @@ def constrained(scene: Scene, seconds: float, single: bool = True) -> Scene:
     ground = ground_pairs(m)[0][0] if len(scene.spheres.geom) else 0
 
     def touch(a: int, b: int) -> Array:
-        return _contact(scene, a, b, fastest, single)
+        return _contact(scene, a, b, fastest, single, onset)
 
     contact = [touch(ground, geom) for geom in scene.spheres.geom.tolist()]
     least = LEAST_WEIGHT_SINGLE if single else LEAST_WEIGHT
@@ -116,13 +120,24 @@ def check_soft(scene: Scene) -> None:
         )
 
 
-def _contact(scene: Scene, ground: int, geom: int, fastest: float, single: bool) -> Array:
+def soften(solimp: Array, onset: float) -> Array:
+    """Return solimp (5,) of a contact that begins softly, or as it is if its impedance rises no faster.
+
+    The impedance begins with at most SOFT and rises over at least `onset` [m], so the contact is nowhere stiffer. A
+    force that begins at zero has a derivative with respect to the time at which the contact begins. With an onset of 0
+    nothing changes.
+    """
+    start, end, width, middle, power = solimp
+    return np.array([min(start, SOFT), end, max(width, onset), middle, power]) if onset else solimp
+
+
+def _contact(scene: Scene, ground: int, geom: int, fastest: float, single: bool, onset: float) -> Array:
     m = scene.mj_model
     law = pair_law(m, ground, geom)
     weight = m.body_invweight0[m.geom_bodyid[[ground, geom]], 0].sum()
     weight = max(weight, LEAST_WEIGHT_SINGLE if single else LEAST_WEIGHT)
     friction = max(law.friction, LEAST_FRICTION) if law.condim > 1 else 0.0
-    numbers = _numbers(law.solref, law.solimp, weight, law.margin, fastest)
+    numbers = _numbers(law.solref, soften(law.solimp, onset), weight, law.margin, fastest)
     numbers[2:4] = friction, 1 / m.opt.impratio
     name, end = f"{scene.name}: geom {label(m, mujoco.mjtObj.mjOBJ_GEOM, geom)}", numbers[5:7].max()
     edges = 2 * friction**2 * (1 + friction**2) / m.opt.impratio * (1 - end) / end

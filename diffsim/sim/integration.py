@@ -19,12 +19,14 @@ class Integration(NamedTuple):
         substeps: integration steps per control step.
         implicit: only "soft": damping and friction act at the end of a substep. Otherwise it is semi-implicit Euler.
         tolerance: only "mujoco": residual that ends Newton's method, see Simulator.residual.
+        onset: only "mujoco": length [m] over which a contact begins, see robot.constraint.soften; 0: as in the file.
     """
 
     contact: str = "soft"
     substeps: int = 16
     implicit: bool = False
     tolerance: float = TOLERANCE
+    onset: float = 0.0
 
     def check(self) -> Integration:
         """Itself, with plain ints; raises ValueError, with what is allowed, if it cannot be integrated so."""
@@ -35,6 +37,8 @@ class Integration(NamedTuple):
             raise ValueError("implicit is True, but only soft contact has an implicit integrator")
         if not is_real(self.tolerance) or not 0 < self.tolerance < 1:
             raise ValueError(f"tolerance is {self.tolerance!r}, must lie between 0 and 1")
+        if not is_real(self.onset) or not 0 <= self.onset <= (self.contact == "mujoco"):
+            raise ValueError(f"onset is {self.onset!r}, must be 0 to 1 m on MuJoCo's contact, and 0 on soft contact")
         return self._replace(substeps=check_count("substeps", self.substeps, MOST_SUBSTEPS))
 
 

@@ -71,7 +71,7 @@ class Launcher:
         self.num_blocks = -(-num_envs // block)
         with building:
             self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
-            self._model = model_of(scene, division, real, str(self.device))
+            self._model, self._division = model_of(scene, division, real, str(self.device)), division
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
         work = num_envs * how.substeps * scene.nlink
@@ -98,6 +98,13 @@ class Launcher:
                 )
                 for first, end in self._shares
             ]
+
+    def rewrite(self, scene: Scene, names: Iterable[str], columns: slice = slice(None)) -> None:
+        """Copy arrays of a scene with the same kernels, or their columns, to where the kernels read them."""
+        model = model_of(scene, self._division, self.spec.dtype, "cpu")
+        for name in names:
+            if (array := getattr(self._model, name, None)) is not None:
+                wp.to_torch(array)[..., columns].copy_(wp.to_torch(getattr(model, name))[..., columns])
 
     def batch(self, parts: Iterable[torch.Tensor]) -> Any:
         """Make the kernels' struct Batch of its fields."""

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch.autograd.forward_ad import unpack_dual
 
-from diffsim.robot.constraint import check_soft, constrained
+from diffsim.robot.constraint import IMPEDANCE, check_soft, constrained
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory
@@ -89,11 +89,7 @@ class Simulator:
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
         self._end_widths = scene.nq, scene.nv + hard  # with constraints a column for the residual
         check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
-        if hard:
-            scene = constrained(scene, control_dt / how.substeps, self.dtype == torch.float32)
-        else:
-            check_soft(scene)
-        self._launcher = Launcher(scene, n, self.options)
+        self._launcher = Launcher(self._with_contact(scene, how), n, self.options)
         self._factors, self._forces = self._zeros(n, width) + 1, self._zeros(n, bodies, 6)
         self._start, self._g_start = self._zeros(slots, n, sum(self._widths)), self._zeros(n, sum(self._widths))
         self._end, self._g_end = self._zeros(n, sum(self._end_widths)), self._zeros(n, scene.nq + scene.nv)
@@ -139,6 +135,28 @@ class Simulator:
     @forces.setter
     def forces(self, value: torch.Tensor) -> None:
         self._forces = self._check_given("forces", value, *self._forces.shape[1:])
+
+    def set_onset(self, metres: float) -> None:
+        """Let contacts begin over another length from the next step on, see Integration.onset; 0: as in the file.
+
+        Nothing is compiled anew, and captured CUDA graphs follow. Earlier steps have no adjoint any more.
+
+        Raises:
+            ValueError: soft contact, or a length out of range.
+        """
+        how = self.integration._replace(onset=metres).check()
+        if how.contact == "mujoco":
+            scene = self._with_contact(self.scene, how)
+            self._launcher.rewrite(scene, ("contact_params", "row_params"), IMPEDANCE)
+        self.integration, self.options = how, self.options._replace(integration=how)
+        self._versions = [version + 1 for version in self._versions]
+
+    def _with_contact(self, scene: Scene, how: Integration) -> Scene:
+        """Return a copy with MuJoCo's constraints, or the scene itself on soft contact, if it supports the scene."""
+        if how.contact == "mujoco":
+            return constrained(scene, self.control_dt / how.substeps, self.dtype == torch.float32, how.onset)
+        check_soft(scene)
+        return scene
 
     def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
         """Advance all environments by one control step, differentiable in its arguments, `factors` and `forces`.

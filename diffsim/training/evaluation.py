@@ -159,7 +159,10 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 
 
 def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, seed: int = 0, **others: Any) -> DiffEnv:
-    """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
+    """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script.
+
+    Contacts begin as in the file: --onset is the training's, in `Run.make_env`.
+    """
     options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
     options["threads"] = args.threads or None
     try:
@@ -180,8 +183,8 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
     torch.set_num_threads(1)
     path, state = args.evaluate, checkpoint.load(args.evaluate, args.script())
 
-    def measure(flags: Args) -> Evaluation:
-        env = make_env(flags, flags.eval_episodes)
+    def measure(flags: Args, **options: Any) -> Evaluation:
+        env = make_env(flags, flags.eval_episodes, **options)
         if learner is None:
             return evaluate(env, fitting(checkpoint.load_policy(path).network, env))
         checkpoint.restore(restored := learner(flags, env), state)
@@ -190,28 +193,38 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
     evaluation = measure(args)
     pkgutil.resolve_name(checkpoint.PROVENANCE).compare(state.get("robot"), evaluation.scene)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    write_evaluation(args, evaluation, state["iteration"], **compare_finer(args, evaluation, measure))
+    write_evaluation(args, evaluation, state["iteration"], **compare(args, evaluation, measure))
 
 
-def compare_finer(args: Args, evaluation: Evaluation, measure: Callable[[Args], Evaluation]) -> dict[str, Any]:
+def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluation]) -> dict[str, Any]:
     """Print how much of its return a policy keeps at FINER times the substeps, without --implicit.
 
-    One that keeps less than ENOUGH has learned to exploit the integrator's errors.
+    One that keeps less than ENOUGH has learned to exploit the integrator's errors. After training with --onset, print
+    also how much of the return with that onset is left on the file's own contact, on which policies are evaluated.
 
     Args:
-        measure: evaluates the policy with other arguments.
+        measure: evaluates the policy with other arguments, and options of diffsim.make.
 
     Returns:
-        for evaluation.json: the finer substeps, the return there and the share that is kept.
+        for evaluation.json: the finer substeps, or the onset, with the return there and the share that is kept.
     """
     if not evaluation.compared:
         return {}
-    substeps = FINER * args.substeps
+    own, substeps = evaluation.returns.median().item(), FINER * args.substeps
     value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
-    share = kept(evaluation.returns.median().item(), value)
-    warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-    say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{warning}")
-    return {"finer": {"substeps": substeps, "return": value, "kept": share}}
+    share = kept(own, value)
+    say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{_warning(share, 'more substeps')}")
+    found = {"finer": {"substeps": substeps, "return": value, "kept": share}}
+    if args.onset:
+        value = measure(args, onset=args.onset).returns.median().item()
+        share, onset = kept(value, own), f"the training's onset of {args.onset:g} m"
+        say(f"{onset}: return median {value:.1f}, {share:.1%} retained without{_warning(share, 'a smaller --onset')}")
+        found["onset"] = {"metres": args.onset, "return": value, "kept": share}
+    return found
+
+
+def _warning(share: float, remedy: str) -> str:
+    return "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with {remedy}"
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:

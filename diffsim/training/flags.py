@@ -15,7 +15,7 @@ import tyro
 from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
 from diffsim.training import checkpoint
 from diffsim.training.errors import fail, in_one_line
-from diffsim.training.ranges import Count, Natural, Range, check_ranges, flag
+from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, flag
 
 FIXED = ("env", "seed", "num_envs", "control_dt")  # with --resume; what else must fit, `restore` tells
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
@@ -64,6 +64,8 @@ class Flags:
     """simulation steps per control step (per task, --contact and --accuracy)"""
     implicit: bool = False
     """on soft contact, damping and friction act at the end of a substep (per task and --accuracy)"""
+    onset: Fraction = 0.0
+    """on MuJoCo's contact, metres over which contacts of the training begin; 0: as in the file (docs/transfer.md)"""
     compile: bool = False
     """fuse torch's operations with torch.compile: on a GPU shorter iterations, a longer start (docs/performance.md)"""
     threads: Natural = 0
@@ -82,6 +84,8 @@ class Flags:
         """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""
         if self.contact == "mujoco" and self.implicit:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
+        if self.contact != "mujoco" and self.onset:
+            fail(f"--onset is for --contact mujoco, and the contact is {self.contact}")
         if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
 
@@ -134,7 +138,8 @@ def _presets(args: Flags) -> dict[str, Any]:
         how = find_task(args.env).integration(args.accuracy, args.contact)
     except ValueError as error:
         fail(error)
-    return {"substeps": how.substeps, "implicit": how.implicit}
+    onset = {} if how.contact == "mujoco" else {"onset": 0.0}
+    return {"substeps": how.substeps, "implicit": how.implicit} | onset
 
 
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:

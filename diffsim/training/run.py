@@ -27,7 +27,7 @@ from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
 from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, lock, make_unused, say
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import Evaluation, Player, compare_finer, make_env, write_evaluation
+from diffsim.training.evaluation import Evaluation, Player, compare, make_env, write_evaluation
 from diffsim.training.flags import Flags
 from diffsim.training.graph import Mark
 from diffsim.training.layers import ObsNormalizer
@@ -128,7 +128,8 @@ class Run:
             fail(f"--num-envs {num_envs} cannot be split evenly among {processes} processes")
         seed = args.seed + distributed.rank() * RANK_SEED
         varied_by = find_task(args.env).varied_by
-        self._env = make_env(args, num_envs // processes, horizon, seed, factors=varied_by is not None, **options)
+        options |= {"factors": varied_by is not None, "onset": args.onset}
+        self._env = make_env(args, num_envs // processes, horizon, seed, **options)
         if varied_by is not None:
             self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
         return self._env
@@ -422,10 +423,10 @@ class Run:
             say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} continues")
         elif self._evaluation:
             evaluation, player = self._evaluation[1], self._player
-            found = compare_finer(args, evaluation, self._evaluate_finer) if player is not None else {}
+            found = compare(args, evaluation, self._evaluate_again) if player is not None else {}
             write_evaluation(args, evaluation, self.iteration, **found)
 
-    def _evaluate_finer(self, args: Flags) -> Evaluation:
-        """Evaluate the policy of the last evaluation once more, in environments of other arguments."""
+    def _evaluate_again(self, args: Flags, **options: Any) -> Evaluation:
+        """Evaluate the policy of the last evaluation once more, in environments of other arguments and options."""
         assert self._player is not None
-        return Player(make_env(args, args.eval_episodes), self._player.policy, self.graphs).evaluate()
+        return Player(make_env(args, args.eval_episodes, **options), self._player.policy, self.graphs).evaluate()
