@@ -165,7 +165,7 @@ class Search:
         self.grounds = [ground for ground, *_ in examples]
         policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
         self.guides = [*map(self.guide, self.grounds, plans)]  # line 1: generate guides
-        rollouts.start = self.first_states()
+        rollouts.start = self.guides[0].x[:1]
         guiding = self.sample_guides()  # line 2: sample their mixture
         policy.theta = self.pretrain()  # line 3: initialise theta*
         self.S.samples = guiding.pick(slice(0))  # line 4: build S from the guides and theta*
@@ -225,10 +225,6 @@ class Search:
         cost = Sum((self.cost, Tracking(ground, plan.x, plan.u, self.args.tracking, 0.5 / spread.square())))
         (guide,) = maximum_entropy_controllers(ground, cost, plan)
         return guide.widened(self.network.sigma)
-
-    def first_states(self) -> Tensor:
-        """(n, nx) from any of which the policy's trajectories start."""
-        return self.guides[0].x[:1]
 
     def sample_guides(self) -> Samples:
         """Line 2. The floor of all later rewards lies as far below the worst step as that one below the best."""

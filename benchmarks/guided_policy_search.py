@@ -228,8 +228,9 @@ class NonGuided(Search):
 class Restart(NonGuided):
     """The policy's samples start at any state of the guides, which are no guides otherwise."""
 
-    def first_states(self) -> Tensor:
-        return torch.cat([guide.x[:-1] for guide in self.guides])
+    def sample_guides(self) -> gps.Samples:
+        self.rollouts.start = torch.cat([guide.x[:-1] for guide in self.guides])
+        return super().sample_guides()
 
 
 class SingleExample(NonGuided):
