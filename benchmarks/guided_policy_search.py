@@ -69,6 +69,7 @@ COUNT = 10  # trajectories over each terrain, from the same start with the polic
 LASTING = ("group", "cell", "seed", "noise")  # key of gps_lasting.csv
 HORIZONS, FACTORS = 3, (1, 3)  # as long as the search looks, and times the policy's noise
 TRAJECTORIES = {"humanoid": 20}  # of others 100
+OTHERS = {"humanoid": (10,)}  # further factors: other tasks search with that noise
 
 Case = Literal[
     "guided", "one-start", "effective-samples", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
@@ -343,7 +344,7 @@ def lasts(path: Path) -> Iterator[Row]:
     T, rollouts = search.args.horizon, search.rollouts
     size = TRAJECTORIES.get(search.args.task, 100), HORIZONS * T, search.system.nu
     noise = torch.randn(size, generator=torch.Generator().manual_seed(gps.SEED), dtype=REAL)
-    for factor in FACTORS:
+    for factor in (*FACTORS, *OTHERS.get(search.args.task, ())):
         S = rollouts.roll_out(search.network.theta, factor * noise, rollouts.start[:1])
         finite = torch.ones_like(S.reward, dtype=torch.bool)  # diverged ones stay where they fell
         ends = {steps: walked(search, S.x[:, : steps + 1], finite[:, :steps]) for steps in (T, HORIZONS * T)}
@@ -398,7 +399,7 @@ NAMES = {
     "policy-gradient": "policy gradient",
     "dagger": "DAgger",
 }
-MAIN = {"full": "", "ddp": ", plan of iLQR", "loud": ", noise of 10 %"}  # cells of the table of tasks
+MAIN = {"full": "", "ddp": ", plan of iLQR"}  # cells of the table of tasks
 
 
 def tasks(runs: Rows, lasting: Rows) -> list[Row]:
