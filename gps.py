@@ -41,13 +41,13 @@ from diffsim.training.run import Run
 
 STORED = 3  # times --active, the samples of S that are kept to choose from
 # fmt: off
-COLUMNS = ("horizon", "control_dt", "action_cost", "hidden", "noise", "tracking", "pretraining_noise")
+COLUMNS = ("horizon", "control_dt", "action_cost", "hidden", "noise", "tracking", "pretraining_noise", "beyond")
 PER_TASK: dict[str, tuple[float, ...]] = {
-    "cartpole": (240, 1 / 60, 1e-3,  50, 0.10, 0.05, 0.50),
-    "hopper":   (500, 0.02,   1e-1,  50, 0.10, 0.05, 0.50),
-    "humanoid": (300, 1 / 60, 1e-1, 200, 0.01, 0.50, 0.50),
-    "swimmer":  (500, 0.05,   1e-2,  50, 0.10, 0.05, 0.30),
-    "walker":   (500, 0.01,   1e-1,  50, 0.10, 0.50, 0.50),
+    "cartpole": (240, 1 / 60, 1e-3,  50, 0.10, 0.05, 0.50, 1),
+    "hopper":   (500, 0.02,   1e-1,  50, 0.10, 0.05, 0.50, 1),
+    "humanoid": (300, 1 / 60, 1e-1, 200, 0.01, 0.50, 0.50, 3),
+    "swimmer":  (500, 0.05,   1e-2,  50, 0.10, 0.05, 0.30, 1),
+    "walker":   (500, 0.01,   1e-1,  50, 0.10, 0.50, 0.50, 1),
 }
 # The paper's reward: v_x* [m/s], p_y* [m], its weight w_h, and that of the trunk's squared rotation, which is ours.
 # Other tasks have their own.
@@ -96,6 +96,8 @@ class Args(Flags):
     """epochs of the fit to the guides"""
     pretraining_noise: Positive = 0.5
     """standard deviation of the guides' actions in the fit, relative to that of the example's actions (per task)"""
+    beyond: Count = 1
+    """a new policy must be better over so many horizons with as many times the noise, too (per task; 1: the paper)"""
     samples: AtLeast2 = 10
     """trajectories of the policy per iteration"""
     active: UpTo10k = 100
@@ -195,6 +197,8 @@ class Search:
             S.append(draw(theta, source, args.guiding_samples))
             own = (S.samples.source == source) | (S.samples.source == self.best)
             better, values = self.estimate(theta, torch.cat((active, own.nonzero().flatten())).unique())
+        if better and args.beyond > 1:  # Eq. 2 looks no further than the horizon
+            better = self.rollouts.endurance(theta) > self.rollouts.endurance(policy.theta)
         metrics |= values | {"gps/accepted": float(better), "gps/regularizer": self.w_r}
         low, high = args.regularizer_bounds
         if better:  # line 11
@@ -272,7 +276,7 @@ class Search:
         policy, iterations, top = self.network, self.args.lbfgs_iterations, S.returns.argmax()
         value = self.objective(S.log_mixture, S.reward / self.scale)
         starts = [policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)][: self.starts]
-        ends = [maximise(lambda theta: sparse(value, policy, theta, S), theta, iterations) for theta in starts]
+        ends = [maximise(lambda theta: policy.sparse(value, theta, S), theta, iterations) for theta in starts]
         start = max(range(len(ends)), key=lambda i: ends[i][1])
         return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
 
@@ -363,9 +367,9 @@ class Rollouts:
         cost = cost + (x[..., system.nq] - target_velocity).square() + attitude_weight * attitude
         return -(cost + height_weight * (height - target_height).square())
 
-    def noise(self, count: int, rng: torch.Generator | None = None) -> Tensor:
-        """(count, T, nu) standard normal."""
-        size, rng = (count, self.args.horizon, self.system.nu), rng or self.rng
+    def noise(self, count: int, rng: torch.Generator | None = None, horizons: int = 1) -> Tensor:
+        """(count, horizons T, nu) standard normal."""
+        size, rng = (count, horizons * self.args.horizon, self.system.nu), rng or self.rng
         return torch.randn(size, generator=rng, dtype=REAL).to(self.system.device)
 
     def measure(self, x: Tensor, u: Tensor, finite: Tensor, source: int = -1) -> Samples:
@@ -389,6 +393,13 @@ class Rollouts:
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
         start = self.start[torch.randint(len(self.start), (count,), generator=self.rng).to(self.start.device)]
         return self.roll_out(theta, noise, start, source)
+
+    def endurance(self, theta: Tensor) -> float:
+        """The mean return of a policy over --beyond horizons with as many times the noise, each time the same."""
+        factor, rng = self.args.beyond, torch.Generator().manual_seed(self.args.seed)
+        noise = factor * self.noise(self.args.samples, rng, factor)
+        self.control_steps += noise.shape[0] * noise.shape[1]
+        return self.roll_out(theta, noise, self.start[:1]).spread[0]
 
     def follow(self, guides: list[LinearGaussian], grounds: list[System], count: int, first: int = 0) -> Samples:
         """So many trajectories of guides in equal shares, each on its ground, numbered from the first source on."""
@@ -441,19 +452,6 @@ def phi(log_pi: Tensor, log_mix: Tensor, reward: Tensor, w_r: float) -> Tensor:
     log_w = log_weights(log_pi, log_mix)
     log_z = torch.logsumexp(log_w, 0) - math.log(len(log_w))
     return (torch.softmax(log_w, 0) * reward).sum() + w_r * log_z.sum()
-
-
-def sparse(value: Callable[[Tensor], Tensor], policy: GaussianPolicy, theta: Tensor, S: Samples) -> Tensor:
-    """A function () of log pi_theta (m, T), with its gradient in theta by Appendix A's sum over steps.
-
-    Steps that count for less than rounding are left out: most, as few samples have a weight that is not negligible.
-    """
-    log_pi = policy.log_prob(theta.detach(), S.obs, S.u).requires_grad_()
-    result = value(log_pi)
-    (slope,) = torch.autograd.grad(result, log_pi)
-    rows = slope.abs() > 1e-20 * slope.abs().max()
-    linear = (slope[rows] * policy.log_prob(theta, S.obs[rows], S.u[rows])).sum()
-    return result.detach() + linear - linear.detach()
 
 
 # The run --------------------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from diffsim.training import Evaluation, evaluate, load_policy, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from diffsim_cli.watch import make_policy_env
-from gps import phi, sparse
+from gps import phi
 
 SMALL = (
     "--env cartpole --horizon 30 --pretraining 40 --hidden 8 --guiding-samples 8 --samples 4 --active 16 "
@@ -80,7 +80,7 @@ def test_gradient_of_phi_is_that_of_appendix_a(w_r: float, rng: np.random.Genera
     assert (gradient - appendix).norm() / appendix.norm() < 1e-10
 
     S = gps.Samples(obs, obs, u, reward, sources, log_q)
-    value = sparse(lambda log_pi: phi(log_pi, mixture, reward, w_r), policy, leaf, S)
+    value = policy.sparse(lambda log_pi: phi(log_pi, mixture, reward, w_r), leaf, S)
     torch.testing.assert_close(value.detach(), objective(theta), rtol=1e-14, atol=0)
     torch.testing.assert_close(torch.autograd.grad(value, leaf)[0], gradient, rtol=1e-10, atol=1e-13)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from diffsim.planning.controller import gaussian_log_prob
 from diffsim.planning.lbfgs import maximise
+from diffsim.planning.samples import Samples
 from diffsim.planning.system import System
 
 BATCH = 256  # of imitate
@@ -55,6 +57,18 @@ class GaussianPolicy(nn.Module):
     def log_prob(self, theta: Tensor, obs: Tensor, u: Tensor) -> Tensor:
         """(...) log pi_theta(u|o)."""
         return gaussian_log_prob(u, self.mean(theta, obs), self.sigma)
+
+    def sparse(self, value: Callable[[Tensor], Tensor], theta: Tensor, S: Samples) -> Tensor:
+        """A function () of log pi_theta (m, T), with its gradient in theta by Levine and Koltun's Appendix A.
+
+        Steps that count for less than rounding are left out: most, as few samples have a weight that is not negligible.
+        """
+        log_pi = self.log_prob(theta.detach(), S.obs, S.u).requires_grad_()
+        result = value(log_pi)
+        (slope,) = torch.autograd.grad(result, log_pi)
+        rows = slope.abs() > 1e-20 * slope.abs().max()
+        linear = (slope[rows] * self.log_prob(theta, S.obs[rows], S.u[rows])).sum()
+        return result.detach() + linear - linear.detach()
 
     def fit(self, theta: Tensor, obs: Tensor, u: Tensor, iterations: int) -> Tensor:
         """The theta under which actions (..., nu) at observations (..., obs_dim) are likeliest, from a first one."""
