@@ -399,7 +399,7 @@ NAMES = {
     "policy-gradient": "policy gradient",
     "dagger": "DAgger",
 }
-MAIN = {"full": "", "ddp": ", plan of iLQR"}  # cells of the table of tasks
+MAIN = {"full": "", "one-horizon": ", `--beyond 1`", "ddp": ", plan of iLQR"}  # cells of the table of tasks
 
 
 def tasks(runs: Rows, lasting: Rows) -> list[Row]:

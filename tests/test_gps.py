@@ -191,6 +191,36 @@ def test_schedule_of_the_regulariser(
     np.testing.assert_allclose(seen, expected if start else 0.0)
 
 
+@pytest.mark.parametrize("lasts", [True, False])
+def test_a_better_policy_lasts_beyond_the_horizon(
+    lasts: bool, search: gps.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With --beyond 3: what is better by Eq. 2 is refused if its return over three horizons is lower."""
+    search.args.beyond, best = 3, search.network.theta
+    monkeypatch.setattr(search, "optimise", lambda S: (best + 1e-3, {}))
+    monkeypatch.setattr(search, "estimate", lambda theta, active: (True, {}))
+    monkeypatch.setattr(search.rollouts, "endurance", lambda theta: float(torch.equal(theta, best) != lasts))
+    assert search.iterate(1)["gps/accepted"] == lasts
+    assert torch.equal(search.network.theta, best) != lasts
+
+
+def test_endurance_is_the_return_of_longer_and_noisier_trajectories(
+    search: gps.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 3 horizons with 3 times the noise, the same each time; the search's own random numbers are left alone."""
+    search.args.beyond, rollouts, seen = 3, search.rollouts, list[Tensor]()
+    roll_out, state = rollouts.roll_out, rollouts.rng.get_state()
+
+    def watch(theta: Tensor, noise: Tensor, start: Tensor) -> gps.Samples:
+        seen.append(noise)
+        return roll_out(theta, noise, start)
+
+    monkeypatch.setattr(rollouts, "roll_out", watch)
+    first, again = (rollouts.endurance(search.network.theta) for _ in range(2))
+    assert first == again and torch.equal(*seen) and seen[0].shape == (4, 90, 1)
+    assert 2.5 < seen[0].std() < 3.5 and torch.equal(rollouts.rng.get_state(), state)
+
+
 def test_guides_reproduce_the_plan(rows: list[dict[str, str]]) -> None:
     """Their mean return is within 1 % of the plan's, and they spread by less."""
     mean, std, plan = (float(rows[0][f"gps_{name}"]) for name in ("guides", "guides_std", "plan"))
