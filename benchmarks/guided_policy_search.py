@@ -581,7 +581,8 @@ def draw(args: CommonFlags) -> None:
     args.publish(
         "gps tasks", markdown(tasks(args.read("gps_runs"), args.read("gps_lasting"))), "gps.md", everywhere=True
     )
-    args.publish("gps terrain", markdown(table(args.read("gps_controllers"))), "gps.md", everywhere=True)
+    if rows := args.read("gps_controllers"):
+        args.publish("gps terrain", markdown(table(rows)), "gps.md", everywhere=True)
     plot(args)
 
 
