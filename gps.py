@@ -127,7 +127,7 @@ class Args(Flags):
             fail(f"{self.env} shows its actor the first {seen} numbers of an observation, and this policy takes all")
         if not (self.demonstration or self.resume or self.evaluate):
             fail(f"--demonstration must be an example for {self.env}; shipped are those of {', '.join(PER_TASK)}")
-        if self.onset:
+        if any(self.onset):
             fail("--onset is not for guides: they are planned on the file's own contact")
         if self.active < (least := self.guiding_samples + self.samples):
             fail(f"--active must be at least {least}, for the guides' and the policy's samples, not {self.active}")

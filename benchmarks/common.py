@@ -144,7 +144,7 @@ class Case(NamedTuple):
         learner += " --symmetric" if args.get("symmetric") else ""
         learner += " randomised" if self.env.task.varied_by else ""
         learner += f" --initial-log-std {first:g}" if (first := args.get("initial_log_std")) else ""
-        learner += f" --onset {onset:g}" if (onset := args.get("onset")) else ""
+        learner += " --onset {:g} {:g}".format(*onset) if any(onset := args.get("onset", ())) else ""
         if not FILE.fullmatch(args["env"]) and (slope := getattr(find_task(args["env"]), "slope", 0.0)):
             learner += f" rough {slope:g}"
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))

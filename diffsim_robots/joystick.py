@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffsim.sim.elevation import Elevation
 from diffsim.symmetry.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, partners, reflections
-from diffsim.tasks.base import Contact, Task
+from diffsim.tasks.base import Contact, Defaults, Task
 from diffsim.tasks.locomotion import rotate
 from diffsim_robots.common import push, score
 from diffsim_robots.feet import Feet
@@ -99,7 +99,7 @@ class Joystick(Task):
 
     robot: ClassVar[Robot]
     contact: ClassVar[Contact] = "mujoco"
-    symmetric = True
+    symmetric, initial_gain = True, 0.01
     varied_by = "diffsim_robots.variation:Variation"
     ranges: ClassVar[Ranges] = {
         "friction": (0.7, 1.3),
@@ -325,16 +325,35 @@ class Joystick(Task):
         return (part["true_projected_gravity"][..., 2] > -0.5) | (part["height"][..., 0] < 0.6 * self.robot.height)
 
 
+# Learners begin near the standing pose, with little noise.
+BEGIN: dict[str, Any] = {
+    "critic_hidden": (256, 128),
+    "critic_lr": 1e-3,
+    "target_alpha": 0.9,
+    "initial_log_std": -2.0,
+    "adjoint_clip": 5.0,
+}
+BEGIN_RPO = BEGIN | {"horizon": 16, "num_envs": 64, "critic_iterations": 4, "epochs": 4, "trust": 0.5}
+QUADRUPED: Defaults = {
+    "shac": BEGIN | {"iterations": 600},
+    "shac gpu": {"num_envs": 1024, "iterations": 1000},
+    "rpo": BEGIN_RPO | {"iterations": 400},
+    "rpo gpu": {"num_envs": 1024},
+}
+
+
 class Go1(Joystick):
     """12 joints; action: targets of the servos."""
 
     name, asset, robot = "go1", "go1.xml", quadruped(("FR", "FL", "RR", "RL"))
+    defaults = QUADRUPED
 
 
 class Go2(Joystick):
     """12 joints; action: targets of servos on the motors."""
 
     name, asset, robot = "go2", "go2.xml", quadruped(("FL", "FR", "RL", "RR"))
+    defaults = QUADRUPED
 
 
 class G1(Joystick):
@@ -343,3 +362,11 @@ class G1(Joystick):
     name, asset, robot = "g1", "g1.xml", humanoid()
     alive, smooth = 2.5, 1.0
     ranges = {name: Joystick.ranges[name] for name in ("friction", "mass", "motor", "latency")} | {"push": (0.5, 1.5)}
+    defaults: ClassVar[Defaults] = {
+        "shac": BEGIN | {"horizon": 16, "iterations": 1500},
+        "rpo": BEGIN_RPO | {"initial_log_std": -3.0, "iterations": 600},
+        "rpo gpu": {"num_envs": 1024},
+        "sapo": BEGIN | {"horizon": 16, "target_entropy": (-1.0, -1.0), "critic_iterations": 4, "iterations": 1200},
+        "sapo gpu": {"num_envs": 1024},
+        "sapo cpu": {"iterations": 700},
+    }

@@ -1,10 +1,11 @@
 """A Go2 that dribbles a ball to commanded places; docs/tasks.md.
 
 git clone https://github.com/google-deepmind/mujoco_menagerie
-python rpo.py --env examples/dribble.py --horizon 16 --adjoint-clip 5 --initial-log-std -2 --num-envs 128 \\
-    --iterations 1600 --critic-hidden 256 128 --critic-lr 1e-3
+python rpo.py --env examples/dribble.py
 python benchmarks/own_tasks.py runs/<run> --own examples/dribble.py --file mujoco_menagerie/unitree_go2/scene.xml
 """
+
+from typing import ClassVar
 
 import mujoco
 import torch
@@ -13,8 +14,9 @@ from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
+from diffsim.tasks.base import Defaults
 from diffsim_robots.common import score
-from diffsim_robots.joystick import Go2
+from diffsim_robots.joystick import BEGIN, Go2
 
 RADIUS, MASS, DRAG = 0.11, 0.43, 0.002  # m, kg, N s/m and N m s: a football of size 5 that comes to rest
 STIFFNESS, RANGE = 40.0, {"hip": (-0.4, 0.4), "thigh": (0.2, 1.6), "calf": (-2.5, -1.1)}  # N m/rad, rad: as of "go2"
@@ -31,6 +33,8 @@ class Dribble(Go2):
     """
 
     name, asset, symmetric = "dribble", "mujoco_menagerie/unitree_go2/scene.xml", False
+    initial_gain = 1.0
+    defaults: ClassVar[Defaults] = {"rpo": BEGIN | {"horizon": 16, "num_envs": 128, "iterations": 1600}}
     num_random = Go2.num_random + 13
     actor_dim, obs_dim, obs_parts = BALL + (Go2.actor_dim or 0), BALL + Go2.obs_dim, ()
 

@@ -247,14 +247,14 @@ def test_a_bad_onset_is_refused(value):
 
 def test_soft_contact_has_no_onset():
     for words, message in (
-        ("--onset 0.02", "--onset is for --contact mujoco, and the contact is soft"),
-        ("--contact mujoco --onset -1", "--onset must be in [0, 1], not -1.0"),
-        ("--contact mujoco --onset nan", "--onset must be finite, not nan"),
+        ("--onset 0.02 0", "--onset is for --contact mujoco, and the contact is soft"),
+        ("--contact mujoco --onset 0 -1", "--onset must be in [0, 1], not -1.0"),
+        ("--contact mujoco --onset nan 0", "--onset must be finite, not nan"),
     ):
         with pytest.raises(ValueError) as error:
             parse_flags(shac.Args, ["--env", "ant", *words.split()])
         assert str(error.value) == message
-    assert parse_flags(shac.Args, "--env go2 --onset 0.03".split()).onset == 0.03  # whose contact is MuJoCo's
+    assert parse_flags(shac.Args, "--env go2 --onset 0.03 0".split()).onset == (0.03, 0.0)  # whose contact is MuJoCo's
 
 
 def test_training_has_the_onset_and_evaluation_has_not(tmp_path, monkeypatch, capsys):
@@ -267,26 +267,40 @@ def test_training_has_the_onset_and_evaluation_has_not(tmp_path, monkeypatch, ca
 
     monkeypatch.setattr(diffsim, "make", recorded)
     monkeypatch.setattr(Evaluation, "compared", True)
-    words = "--env cartpole --contact mujoco --onset 0.02 --device cpu --num-envs 4 --horizon 4 --iterations 3"
+    words = "--env cartpole --contact mujoco --onset 0.02 0.02 --device cpu --num-envs 4 --horizon 4 --iterations 3"
     state = run(shac, tmp_path, *words.split(), "--eval-episodes", 2, "--quiet", stop_after=2)
-    assert state["args"]["onset"] == 0.02 and made[0] == 0.02 and 0.02 not in made[1:]
+    assert [*state["args"]["onset"]] == [0.02, 0.02] and made[0] == 0.02 and 0.02 not in made[1:]
     made.clear()
     run(shac, tmp_path, "--resume", tmp_path, "--quiet")
     assert made == [0.02, 0.0, 0.0, 0.02]  # to train, to evaluate, with finer substeps, and what training has seen
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("the training's onset")]
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("the training's last onset")]
     written = json.loads((tmp_path / "evaluation.json").read_text())
     made.clear()
     shac.main(["--evaluate", str(tmp_path)])
     assert made == [0.0, 0.0, 0.02] and json.loads((tmp_path / "evaluation.json").read_text()) == written
     assert line in capsys.readouterr().out
-    assert line.startswith(f"the training's onset of 0.02 m: return median {written['onset']['return']:.1f}, ")
+    assert line.startswith(f"the training's last onset of 0.02 m: return median {written['onset']['return']:.1f}, ")
     made.clear()
     shac.main(["--evaluate", str(tmp_path), "--contact", "soft"])
-    assert made == [0.0, 0.0] and "the training's onset" not in capsys.readouterr().out
+    assert made == [0.0, 0.0] and "the training's last onset" not in capsys.readouterr().out
     assert make_policy_env(load_policy(tmp_path), 1).sim.integration.onset == made[2] == 0.0
     with pytest.raises(SystemExit):
-        shac.main(["--evaluate", str(tmp_path), "--onset", "0.01"])
-    assert "--onset 0.02, which cannot change to 0.01" in capsys.readouterr().err
+        shac.main(["--evaluate", str(tmp_path), "--onset", "0.01", "0.01"])
+    assert "--onset (0.02, 0.02), which cannot change to (0.01, 0.01)" in capsys.readouterr().err
+
+
+def test_the_onset_goes_from_the_first_to_the_last_also_after_a_resume(tmp_path, monkeypatch):
+    told = list[float]()
+    monkeypatch.setattr(Simulator, "set_onset", lambda sim, metres: told.append(metres))
+    words = "--env cartpole --contact mujoco --onset 0.03 0.01 --device cpu --num-envs 4 --horizon 4 --iterations 40"
+    few = "--critic-iterations 1 --eval-every 0 --eval-episodes 1 --save-every 0 --quiet"
+    run(shac, tmp_path, *words.split(), *few.split(), stop_after=15)
+    assert told == pytest.approx([0.03, 0.025])
+    run(shac, tmp_path, "--resume", tmp_path, stop_after=25)
+    assert told[2:] == pytest.approx([0.02])
+    told.clear()
+    run(shac, tmp_path / "same", *words.replace("0.01", "0.03").split(), *few.split(), stop_after=15)
+    assert not told
 
 
 def test_what_is_retained_of_the_return_with_the_onset(monkeypatch, capsys):
@@ -298,13 +312,13 @@ def test_what_is_retained_of_the_return_with_the_onset(monkeypatch, capsys):
     def measure(args, onset=0.0):
         return result(200.0 if onset else 99.0)
 
-    args = shac.Args(contact="mujoco", onset=0.03, substeps=4)
+    args = shac.Args(contact="mujoco", onset=(0.05, 0.03), substeps=4)
     found = evaluation.compare(args, result(100.0), measure)
     assert found["onset"] == {"metres": 0.03, "return": 200.0, "kept": 0.5}
     assert found["finer"] == {"substeps": 16, "return": 99.0, "kept": 0.99}
     assert capsys.readouterr().out.splitlines() == [
         "16 substeps: return median 99.0, 99.0% retained",
-        "the training's onset of 0.03 m: return median 200.0, 50.0% retained without; less than 97%: train with a "
+        "the training's last onset of 0.03 m: return median 200.0, 50.0% retained without; less than 97%: train with a "
         "smaller --onset",
     ]
     assert evaluation.compare(shac.Args(substeps=4), result(100.0), measure).keys() == {"finer"}
@@ -316,5 +330,5 @@ def test_checkpoints_without_an_onset_load(tmp_path):
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     del state["args"]["onset"]
     torch.save(state, tmp_path / "checkpoint.pt")
-    assert parse_flags(shac.Args, ["--resume", str(tmp_path), "--iterations", "2"]).onset == 0.0
+    assert parse_flags(shac.Args, ["--resume", str(tmp_path), "--iterations", "2"]).onset == (0.0, 0.0)
     shac.main(["--evaluate", str(tmp_path), "--run-dir", str(tmp_path / "new")])

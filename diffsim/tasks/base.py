@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import pkgutil
 import sys
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
@@ -28,6 +29,7 @@ from diffsim.sim.integration import TOLERANCE, Contact, Integration, check_conta
 
 Accuracy = Literal["fast", "default", "accurate"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
+Defaults: TypeAlias = Mapping[str, Mapping[str, Any]]
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
 OPTIONS = "diffsim_robots.variation:configure"  # reads options after a task's name
 OWN_TASK = "diffsim.tasks.own_task"  # checks tasks outside this package, centres actions
@@ -56,6 +58,9 @@ class Task:
     forward_column: int | None  # of qpos [m], grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
+    like: ClassVar[str | None] = None  # a task of the paper, with whose settings learners begin
+    defaults: ClassVar[Defaults] = {}  # of learners' flags, by script, "shac", and by script and device, "shac gpu"
+    initial_gain: ClassVar[float] = 1.0  # factor of an actor's last weights at first; below 1: small actions (mlp)
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
     mirrored_by: ClassVar[str | None] = None  # "module:function" that makes its `mirror`
     varied_by: ClassVar[str | None] = None  # "module:Class" of what a training changes, see diffsim_robots/variation.py

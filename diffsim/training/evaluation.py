@@ -215,11 +215,11 @@ def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluatio
     share = kept(own, value)
     say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{_warning(share, 'more substeps')}")
     found = {"finer": {"substeps": substeps, "return": value, "kept": share}}
-    if args.onset:
-        value = measure(args, onset=args.onset).returns.median().item()
-        share, onset = kept(value, own), f"the training's onset of {args.onset:g} m"
-        say(f"{onset}: return median {value:.1f}, {share:.1%} retained without{_warning(share, 'a smaller --onset')}")
-        found["onset"] = {"metres": args.onset, "return": value, "kept": share}
+    if onset := args.onset[1]:
+        value = measure(args, onset=onset).returns.median().item()
+        share, name = kept(value, own), f"the training's last onset of {onset:g} m"
+        say(f"{name}: return median {value:.1f}, {share:.1%} retained without{_warning(share, 'a smaller --onset')}")
+        found["onset"] = {"metres": onset, "return": value, "kept": share}
     return found
 
 

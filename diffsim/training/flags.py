@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -64,8 +64,8 @@ class Flags:
     """simulation steps per control step (per task, --contact and --accuracy)"""
     implicit: bool = False
     """on soft contact, damping and friction act at the end of a substep (per task and --accuracy)"""
-    onset: Fraction = 0.0
-    """on MuJoCo's contact, metres over which contacts of the training begin; 0: as in the file (docs/transfer.md)"""
+    onset: tuple[Fraction, Fraction] = (0.0, 0.0)
+    """on MuJoCo's contact, metres over which contacts begin, first and last in training (0: as in the file)"""
     compile: bool = False
     """fuse torch's operations with torch.compile: on a GPU shorter iterations, a longer start (docs/performance.md)"""
     threads: Natural = 0
@@ -76,15 +76,24 @@ class Flags:
         """The task's name without options: tables of defaults are by it."""
         return base_name(self.env)
 
+    @property
+    def like(self) -> str:
+        """The name of the task whose settings it begins with: Task.like, or its own."""
+        like = find_task(self.env).like
+        return self.task if like is None else find_task(like).name
+
     def task_defaults(self) -> dict[str, Any]:
-        """Return defaults that depend on other flags, such as the task, the device or the preset."""
-        return {"symmetric": find_task(self.env).symmetric} if hasattr(self, "symmetric") else {}
+        """Return the learner's defaults that depend on other flags, such as the task, the device or the preset.
+
+        What the task itself sets (Task.defaults, Task.symmetric) replaces them.
+        """
+        return {}
 
     def check(self) -> None:
         """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""
         if self.contact == "mujoco" and self.implicit:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
-        if self.contact != "mujoco" and self.onset:
+        if self.contact != "mujoco" and any(self.onset):
             fail(f"--onset is for --contact mujoco, and the contact is {self.contact}")
         if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
@@ -123,7 +132,9 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         task = find_task(args.env)
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
             args.contact = task.contact
-        defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
+        defaults = dataclasses.replace(
+            kind(), contact=args.contact, **(_presets(args) | args.task_defaults() | _of_task(args))
+        )
         args = _cli(kind, argv, defaults)
     check_ranges(args)
     (Flags.check if args.evaluate else kind.check)(args)  # an evaluation skips checks that concern training
@@ -138,8 +149,20 @@ def _presets(args: Flags) -> dict[str, Any]:
         how = find_task(args.env).integration(args.accuracy, args.contact)
     except ValueError as error:
         fail(error)
-    onset = {} if how.contact == "mujoco" else {"onset": 0.0}
+    onset = {} if how.contact == "mujoco" else {"onset": (0.0, 0.0)}
     return {"substeps": how.substeps, "implicit": how.implicit} | onset
+
+
+def _of_task(args: Flags) -> dict[str, Any]:
+    """Look up the defaults that the task sets for this script, on this device."""
+    task, script, device = find_task(args.env), args.script(), "cpu" if args.device == "cpu" else "gpu"
+    values = {"symmetric": task.symmetric} if hasattr(args, "symmetric") else {}
+    if wrong := [key for key, given in task.defaults.items() if not isinstance(given, Mapping)]:
+        fail(f"task {args.env!r}: defaults are by script, such as {{'shac': {{'horizon': 16}}}}, not {wrong[0]!r}")
+    values |= {**task.defaults.get(script, {}), **task.defaults.get(f"{script} {device}", {})}
+    if unknown := ", ".join(flag(name) for name in values if not hasattr(args, name)):
+        fail(f"task {args.env!r} has defaults of flags that {script}.py lacks: {unknown}")
+    return values
 
 
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:

@@ -44,6 +44,7 @@ REPORTED = {  # totals that are reported each time they double
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 RANK_SEED = 1_000_003  # between the seeds of two ranks
 LOG_EVERY = 10  # a GPU's iterations are written in batches of this many, so that the host rarely waits
+ONSET_EVERY = 10  # iterations between two lengths of the onset
 RUNS = Path("runs")  # parent of runs without --run-dir
 
 
@@ -128,7 +129,7 @@ class Run:
             fail(f"--num-envs {num_envs} cannot be split evenly among {processes} processes")
         seed = args.seed + distributed.rank() * RANK_SEED
         varied_by = find_task(args.env).varied_by
-        options |= {"factors": varied_by is not None, "onset": args.onset}
+        options |= {"factors": varied_by is not None, "onset": args.onset[0]}
         self._env = make_env(args, num_envs // processes, horizon, seed, **options)
         if varied_by is not None:
             self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
@@ -217,6 +218,7 @@ class Run:
                 self.iteration += 1
                 if self._variation is not None:
                     self._variation.set(self.iteration)
+                self._set_onset()
                 yield self.iteration
                 self._end_iteration()
         finally:
@@ -224,6 +226,12 @@ class Run:
         self._summarise()
         if self._signals:
             sys.exit(128 + self._signals[0])
+
+    def _set_onset(self) -> None:
+        """Move the onset of contacts along its way from the first to the last."""
+        first, last = self.args.onset
+        if self._env is not None and first != last and is_due(self.iteration - 1, ONSET_EVERY):
+            self._env.sim.set_onset(first + (last - first) * (self.iteration - 1) / self.args.iterations)
 
     def log(self, metrics: Mapping[str, Tensor | float], control_steps: int | None = None) -> None:
         """Take an iteration's metrics; those of its episodes come from the environment of `make_env`.

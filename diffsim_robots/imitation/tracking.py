@@ -7,7 +7,7 @@ data: a subclass with its file, the names of its sides and the number of its joi
 from __future__ import annotations
 
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Array, Scene
 from diffsim.symmetry.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
-from diffsim.tasks.base import Contact, TaskError
+from diffsim.tasks.base import Contact, Defaults, TaskError
 from diffsim.tasks.locomotion import rotate
 from diffsim_cli.gait import trace
 from diffsim_robots.common import push, score
@@ -34,6 +34,15 @@ AHEAD = 3  # frames, how much earlier the reference is seen
 SLIPPING = 2.5  # recorded feet slip less than a third of what they seem to with another order of the quaternion
 STILL = 0.01  # m/s of the feet, below which a clip may stand still in any order
 TURNED = 1.0  # rad; the episode ends when the root is turned from the reference's by more
+# Learners begin near the reference pose, with little noise: more throws the robot over.
+BEGIN: dict[str, Any] = {
+    "critic_hidden": (512, 256),
+    "critic_lr": 1e-3,
+    "target_alpha": 0.9,
+    "initial_log_std": -2.0,
+    "adjoint_clip": 5.0,
+    "horizon": 16,
+}
 
 
 def slip(depth: Array, slide: Array) -> float:
@@ -249,3 +258,14 @@ class G1Track(Tracking):
 
     name, asset, joints, sides = "g1_track", "g1.xml", 29, (("right_", "left_"),)
     default_clip = "g1_karate"
+    initial_gain = 0.01
+    defaults: ClassVar[Defaults] = {
+        "shac": BEGIN | {"num_envs": 1024, "iterations": 1500},
+        "rpo": BEGIN | {"num_envs": 256, "initial_log_std": -3.0, "epochs": 4, "trust": 0.5, "iterations": 400},
+        "rpo gpu": {"num_envs": 1024},
+        "sapo": BEGIN | {"adjoint_clip": 0.0, "target_entropy": (-1.0, -2.0), "iterations": 700},
+        "sapo gpu": {"num_envs": 1024, "critic_iterations": 8},
+        "sapo cpu": {"critic_hidden": (256, 128), "critic_iterations": 4, "iterations": 1300},
+        "ppo_baseline": {"hidden": (512, 256, 128), "horizon": 24, "initial_log_std": -1.0},
+        "ppo_baseline gpu": {"num_envs": 4096, "minibatch_size": 24576},
+    }
