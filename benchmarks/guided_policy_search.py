@@ -438,7 +438,7 @@ def plot(args: CommonFlags) -> None:
         for column, look in (("pretrained", "k|"), ("end", "C0o" if cell == "full" else "C1o")):
             axis.plot(numbers(own, column), [-place] * len(own), look, alpha=0.7)
     axis.axvline(mean(numbers(rows, "guides")), color="k", linestyle="--", linewidth=1)
-    axis.set(xlabel="return (dashed: guides; strokes: before the search)", xscale="symlog")
+    axis.set(xlabel="return (dashed: guides; strokes: before the search)", xscale="symlog", xlim=(-2600, -50))
     axis.set_yticks(range(0, -len(NAMES), -1), NAMES.values())
     axis.xaxis.set_major_formatter("{x:.0f}")
     axis.grid(alpha=0.3)
