@@ -493,7 +493,7 @@ class HumanoidExample(Humanoid):
 
 
 @dataclass
-class Recording:
+class RecordArgs:
     to: Path  # the file, an .npz
     env: str = "walker"  # task of gps.py
     run: Path | None = None  # of any script, whose policy acts
@@ -528,7 +528,7 @@ def exchanged(system: System, path: Path) -> tuple[Tensor, Tensor]:
     return torch.stack((x, other)).float(), torch.stack((u, u[:, motors])).float()
 
 
-def record(args: Recording) -> None:
+def record(args: RecordArgs) -> None:
     words = ["--env", args.env, "--device", "cpu", "--demonstration", str(args.to)]
     flags = parse(VariantArgs, words)
     search = Search(flags, make_env(flags, 1))
@@ -565,13 +565,18 @@ def record(args: Recording) -> None:
 # The commands ---------------------------------------------------------------------------------------------------------
 
 
-def last(args: CheckpointFlags) -> None:
+@dataclass
+class RunArgs(CheckpointFlags):
+    """What last and walk take."""
+
+
+def last(args: RunArgs) -> None:
     for path in args.measured:
         for row in lasts(path):
             args.keep("gps_lasting", row, LASTING)
 
 
-def walk(args: CheckpointFlags) -> None:
+def walk(args: RunArgs) -> None:
     for path in args.measured:
         for row in walks(path):
             args.keep("gps_controllers", row, KEY)
@@ -592,10 +597,10 @@ train = script(
     lambda args: evaluate_checkpoint(args, CASES[args.case]),
 )
 COMMANDS: dict[str, tuple[Callable[..., None], type]] = {
-    "last": (last, CheckpointFlags),
-    "walk": (walk, CheckpointFlags),
+    "last": (last, RunArgs),
+    "walk": (walk, RunArgs),
     "draw": (draw, CommonFlags),
-    "record": (record, Recording),
+    "record": (record, RecordArgs),
 }
 
 

@@ -12,7 +12,6 @@ import guided_policy_search as benchmark
 import numpy as np
 import pytest
 import torch
-from common import CheckpointFlags
 from guided_policy_search import Ground, named_terrains
 from learners import ROOT, SMALL, assert_same, refusal, run
 from planning.systems import jacobian_errors
@@ -253,13 +252,13 @@ def search(trained: Path) -> gps.Search:
 def test_the_command(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The guide hops over level ground; a second call draws from the csv file alone."""
     monkeypatch.setattr(benchmark, "terrains", lambda env: {"some": ["level", "incline:60:-1"]})
-    benchmark.walk(CheckpointFlags(checkpoints=(trained,), output=tmp_path))
+    benchmark.walk(benchmark.RunArgs(checkpoints=(trained,), output=tmp_path))
     rows = {(row["terrain"], row["controller"]): row for row in read_csv(tmp_path / "gps_controllers.csv")}
     assert (
         len(rows) == 6 and rows["level", "ddp 1"]["walked"] == "1" and rows["incline:60:-1", "ddp 1"]["walked"] == "0"
     )
     before = (tmp_path / "gps_controllers.csv").read_bytes()
-    benchmark.walk(CheckpointFlags(draw_only=True, output=tmp_path))
+    benchmark.walk(benchmark.RunArgs(draw_only=True, output=tmp_path))
     assert before == (tmp_path / "gps_controllers.csv").read_bytes()
 
 
@@ -299,7 +298,7 @@ def test_the_table_has_the_best_guide_of_each_training() -> None:
 
 def test_what_lasts_is_looked_at_for_three_horizons(trained: Path, tmp_path: Path) -> None:
     """And with three times the noise; a short walk of the first horizon is too short for all three."""
-    benchmark.last(CheckpointFlags(checkpoints=(trained,), output=tmp_path))
+    benchmark.last(benchmark.RunArgs(checkpoints=(trained,), output=tmp_path))
     rows = read_csv(tmp_path / "gps_lasting.csv")
     assert [(row["noise"], row["trajectories"], row["steps"]) for row in rows] == [
         ("1", "100", "12"),
@@ -370,7 +369,7 @@ def test_tasks_of_examples_have_the_reward_of_gps(task: type[benchmark.Hopper]) 
 def test_a_recorded_policy(tmp_path: Path) -> None:
     """Its states follow from its actions."""
     run(shac, tmp_path / "run", *SMALL["shac"])
-    benchmark.record(benchmark.Recording(to=tmp_path / "one.npz", env="cartpole", run=tmp_path / "run", steps=12))
+    benchmark.record(benchmark.RecordArgs(to=tmp_path / "one.npz", env="cartpole", run=tmp_path / "run", steps=12))
     system = System(diffsim.make("cartpole", 1))
     ((x, u),) = load_demonstration(system, tmp_path / "one.npz", 12)
     played, _, _ = system.rollout(x[:1], 12, lambda t, _: u[t : t + 1])
@@ -379,7 +378,7 @@ def test_a_recorded_policy(tmp_path: Path) -> None:
 
 def test_the_other_leg_first(tmp_path: Path) -> None:
     """The shipped walks begin in one state with different actions, and both are motions of the robot."""
-    benchmark.record(benchmark.Recording(to=tmp_path / "both.npz", exchange=gps.EXAMPLES / "walker.npz"))
+    benchmark.record(benchmark.RecordArgs(to=tmp_path / "both.npz", exchange=gps.EXAMPLES / "walker.npz"))
     args = parse(gps.Args, ["--env", "walker", "--device", "cpu", "--demonstration", str(tmp_path / "both.npz")])
     search = gps.Search(args, make_env(args, 1))
     one, other = search.examples()
@@ -392,11 +391,11 @@ def test_the_other_leg_first(tmp_path: Path) -> None:
 
 
 def test_a_swimmer_swims_forward(tmp_path: Path) -> None:
-    benchmark.record(benchmark.Recording(to=tmp_path / "swim.npz", env="swimmer", steps=60, settle=200))
+    benchmark.record(benchmark.RecordArgs(to=tmp_path / "swim.npz", env="swimmer", steps=60, settle=200))
     x = np.load(tmp_path / "swim.npz")["qpos"][:, 0]
     assert x[0] == 0.0 and x[-1] > 0.6 * 60 * 0.05
 
 
 def test_without_a_run_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = benchmark.Recording(to=tmp_path / "a.npz", env="hopper")
+    args = benchmark.RecordArgs(to=tmp_path / "a.npz", env="hopper")
     assert "--run must be the directory of a run" in refusal(lambda: benchmark.record(args), capsys)

@@ -41,7 +41,8 @@ def test_a_page_has_the_tables_of_the_csv_files(
     monkeypatch.setattr(common.CommonFlags, "publish", publish)
     monkeypatch.setattr(f"{name}.plot", lambda *_: None, raising=False)
     kind = getattr(script, "Args", common.CheckpointFlags)
-    getattr(script, "draw", script.main)(kind(draw_only=True, **flags))
+    main = script.draw if name == "guided_policy_search" else script.main  # which trains
+    main(kind(draw_only=True, **flags))
     assert filled
 
 
