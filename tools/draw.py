@@ -6,6 +6,7 @@
     python tools/draw.py batch diffsim/policies/go2.pt
     python tools/draw.py commands diffsim/policies/go2.pt
     python tools/draw.py learning ant --marks 5 15 60
+    python tools/draw.py searched runs/gps/humanoid__full__1
 
 A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own contact on the file of the robot, from
 the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
@@ -413,6 +414,30 @@ def learning(
     print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
 
 
+def searched(checkpoint: Positional[Path], horizons: int = 3, size: tuple[int, int] = (360, 240)) -> None:
+    """A film of what gps.py has learned, with the noise of its policy, called gps_<task>.webp.
+
+    Args:
+        checkpoint: file or run of gps.py or benchmarks/guided_policy_search.py.
+        horizons: how long it is, in horizons of the search.
+        size: width and height in pixels.
+    """
+    from guided_policy_search import load_search
+
+    search = load_search(checkpoint)
+    rollouts, task, dt = search.rollouts, search.args.task, search.system.control_dt
+    noise = torch.cat([rollouts.noise(1, torch.Generator().manual_seed(k)) for k in range(horizons)], 1)
+    x = rollouts.roll_out(search.network.theta, noise, rollouts.start[:1]).x[0, :, : search.system.nq].numpy()
+    every, zoom = max(1, int(1 / (LEAST_FPS * dt) + 1e-6)), 2
+    with Renderer(search.system.scene, zoom * size[0], zoom * size[1]) as renderer:
+        frames = [
+            titled(halve(renderer.draw(qpos)), f"{k * every * dt:.0f} s, {qpos[0] - x[0, 0]:.0f} m")
+            for k, qpos in enumerate(x[::every])
+        ]
+    path = save_webp(FIGURES / f"gps_{task}.webp", frames, 1 / (every * dt))
+    print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
+
+
 def halve(frame: Frame) -> Frame:
     """2 x 2 pixels into one: smooth edges."""
     height, width = frame.shape[0] // 2, frame.shape[1] // 2
@@ -425,6 +450,7 @@ FILMS: dict[str, Callable[..., None]] = {
     "batch": batch,
     "commands": commands,
     "learning": learning,
+    "searched": searched,
 }
 
 

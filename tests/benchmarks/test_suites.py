@@ -12,7 +12,7 @@ import sac_baseline
 import sapo
 import suites
 from common import RESULTS, ROOT
-from gps_variants import VariantArgs
+from guided_policy_search import VariantArgs
 from tables import read_csv
 
 import pfpn
@@ -22,7 +22,7 @@ import shac
 from diffsim.training import parse
 
 SCRIPTS = {
-    "benchmarks/gps_variants": VariantArgs,
+    "benchmarks/guided_policy_search": VariantArgs,
     "mbpo": mbpo.Args,
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,
