@@ -48,8 +48,8 @@ from tables import Row, grouped, markdown, numbers  # noqa: E402
 import gps  # noqa: E402
 from diffsim import DiffEnv
 from diffsim.planning import REAL, System, load_demonstration, save_demonstration
+from diffsim.robot.profile import TerrainError
 from diffsim.robot.scene import Array, Scene
-from diffsim.robot.terrain import TerrainError
 from diffsim.sim.elevation import Elevation
 from diffsim.symmetry.mirror import partners
 from diffsim.tasks.hopper import Hopper
