@@ -25,8 +25,9 @@ from common import TASKS, CommonFlags, Tasks, run
 from diffsim import SceneError, Simulator, load_scene
 from diffsim.robot.contacts import ground_pairs
 from diffsim.robot.elements import control_range
-from diffsim.robot.pairs import as_primitives, touching
+from diffsim.robot.pairs import touching
 from diffsim.robot.scene import Scene
+from diffsim.robot.shapes import as_primitives
 from diffsim.robot.types import Array
 from diffsim.sim.integration import Integration
 from diffsim.training import fail

@@ -37,7 +37,8 @@ from diffsim.kernels.pairs.adjoint import ACCURACY_ADJOINT
 from diffsim.kernels.pairs.rows import ACCURACY
 from diffsim.kernels.pairs.solver import ROUND_OFF
 from diffsim.robot.elements import control_range
-from diffsim.robot.pairs import as_primitives, with_pairs
+from diffsim.robot.pairs import with_pairs
+from diffsim.robot.shapes import as_primitives
 from diffsim.robot.types import Array
 from diffsim.sim import simulator
 from diffsim.training import Count, fail

@@ -286,7 +286,7 @@ class ParametricSimulator(Simulator):
 
     @parameters.setter
     def parameters(self, values: Mapping[str, Tensor]) -> None:
-        if self._slot:
+        if self._window.used:
             raise RuntimeError("parameters cannot change within a rollout: call rewind() before")
         given = {name: self._robot.check(name, value) for name, value in values.items()}
         new, scene, launcher = load_scene(self._robot.model(self._robot.file | given)), self.scene, self._launcher
@@ -298,7 +298,7 @@ class ParametricSimulator(Simulator):
                 "file, because the kernels contain only what the file uses"
             )
         launcher.rewrite(scene, OF_MODEL)
-        self._versions = [version + 1 for version in self._versions]  # earlier steps have no adjoint any more
+        self._window.forget()  # earlier steps have no adjoint any more
         row = self._robot.columns(self._robot.file | given).to(self.device, self.dtype)
         self._given, self._factors = given, row.expand(self.num_envs, -1)
 

@@ -165,6 +165,8 @@ def check(robot: Positional[Path], contact: Contact = "mujoco") -> None:
         robot: MJCF file.
         contact: contact model of your task; soft needs constants in the file.
     """
+    if robot.suffix == ".py":
+        fail(f"{robot} is code: check reads the MJCF file of the task's robot, its asset")
     try:
         scene = load_scene(robot)
         check_soft(scene) if contact == "soft" else constrained(scene, 1e-3)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from diffsim.robot.scene import Scene
 from diffsim.robot.types import Array, Index
-from diffsim.training.directory import say
 from diffsim.training.evaluation import Evaluation
+from diffsim.training.log import say
 
 EPISODES = 8  # at most as many are measured
 SETTLING = 1.0  # s at the start of an episode that are left out

@@ -17,8 +17,9 @@ from diffsim.robot.contacts import (
     pair_law,
 )
 from diffsim.robot.elements import control_range, label, listed, motors, muscles
-from diffsim.robot.pairs import as_primitives, deviation, directions, is_exact, obstacle_geoms, reach, self_pairs
+from diffsim.robot.pairs import self_pairs
 from diffsim.robot.scene import Scene
+from diffsim.robot.shapes import as_primitives, deviation, directions, is_exact, obstacle_geoms, reach
 from diffsim.tasks.own_task import start_control
 from diffsim_cli.gait import trace
 

@@ -18,8 +18,9 @@ from test_gradient import gradients, weights
 
 from diffsim.robot import pairs as robot_pairs
 from diffsim.robot.constants import constrained
-from diffsim.robot.pairs import as_primitives, with_pairs
+from diffsim.robot.pairs import with_pairs
 from diffsim.robot.scene import FACTORS
+from diffsim.robot.shapes import as_primitives
 from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -520,6 +521,55 @@ def test_several_contacts_in_single_precision_are_near(rng):
     assert residual.max() < 1e-4 and np.median(abs(qvel - expected).max(1) / abs(expected).max(1)) < 1e-4
     for k in range(0, 64, 8):
         check_neighbours(scene, [x[k : k + 8] for x in states])
+
+
+PLATE = 'type="box" size=".2 .1 .05"'
+# Shapes on a plate of that size, at the height where they touch it, exactly along one of its sides or ends
+FLUSH = {
+    "boxes": [
+        (PLATE, f"{x} {y} .0998", turn)
+        for x, y in ((0.05, 0), (-0.05, 0), (-0.2, 0), (0, 0.1), (0, -0.1))
+        for turn in (0, 180)
+    ]
+    + [(f'type="box" size="{size}"', ".1 0 .0898", turn) for size in (".1 .1 .04", ".1 .03 .04") for turn in (0, 90)],
+    "capsules": [
+        (f'type="capsule" fromto="{-a} {y} 0 {b} {y} 0" size=".04"', ".02 0 .0898", 0)
+        for a, b in ((0.4, 0.4), (0.4, 0.3), (0.1, 0.1), (0.1, 0.5), (0.22, 0.1))
+        for y in (0, 0.1, -0.1)
+    ],
+    "spheres": [('size=".06"', place, 0) for place in ("0 0 0", ".1 0 0", ".2 .1 .1", ".2 0 .05")],
+}
+
+
+@needs_manifolds
+@pytest.mark.unoptimized
+@pytest.mark.parametrize("kind", FLUSH)
+def test_flush_shapes_touch_as_in_mujoco(kind, rng):
+    """Where several faces, edges or corners are equally near."""
+    for shape, place, turn in FLUSH[kind]:
+        upper = f'<body pos="{place}" euler="0 0 {turn}"> <freejoint/> <geom {shape}/> </body>'
+        scene = parse(
+            f"<mujoco> <worldbody> <body> <freejoint/> <geom {PLATE}/> </body> {upper} </worldbody> </mujoco>"
+        )
+        states = np.tile(scene.qpos0, (4, 1)), 0.05 * rng.normal(size=(4, scene.nv)), np.zeros((4, 0))
+        expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+        change = abs(expected - states[1]).max(1)
+        np.testing.assert_array_less(abs(step(scene, states)[1] - expected).max(1), 1e-6 * change, f"{shape} {place}")
+
+
+@pytest.mark.unoptimized
+@pytest.mark.parametrize("where", ["reference pose", "keyframe"])
+def test_capsules_that_a_turned_body_makes_parallel_touch_twice(where, rng):
+    qpos = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0.0995, 0.5**0.5, 0, 0.5**0.5, 0])
+    turn = 'euler="0 90 0"' if where == "reference pose" else ""
+    key = "" if turn else f'<keyframe> <key qpos="{" ".join(map(str, qpos))}"/> </keyframe>'
+    logs = f"""<body> <freejoint/> <geom type="capsule" fromto="-.3 0 0 .3 0 0" size=".05"/> </body>
+    <body pos="0 0 .0995" {turn}> <freejoint/> <geom type="capsule" size=".05 .3"/> </body>"""
+    scene = parse(f"<mujoco> <worldbody> {logs} </worldbody> {key} </mujoco>")
+    states = np.tile(qpos, (4, 1)), 0.05 * rng.normal(size=(4, scene.nv)), np.zeros((4, 0))
+    expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+    change = abs(expected - states[1]).max(1)
+    np.testing.assert_array_less(abs(step(scene, states)[1] - expected).max(1), 1e-6 * change)
 
 
 @needs_manifolds

@@ -39,7 +39,7 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
         except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
     else:
-        raise SceneError(f"robot file {str(path)!r} does not exist")
+        raise SceneError(f"robot file {str(path)!r} {'is a folder' if file.is_dir() else 'does not exist'}")
     if left_out := [] if isinstance(path, mujoco.MjModel) else strays(model):
         spec = path.copy() if isinstance(path, mujoco.MjSpec) else mujoco.MjSpec.from_file(str(file))
         for body in left_out:

@@ -17,6 +17,7 @@ from diffsim.sim.launcher import Launcher, check_memory
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options
 from diffsim.sim.tangent import Tangent
+from diffsim.sim.window import Window
 
 DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # that the constraints' adjoint divides by
 PASSES = 30  # of Newton's method in a substep, at most, as measured in docs/physics.md
@@ -88,7 +89,8 @@ class Simulator:
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
         self._end_widths = scene.nq, scene.nv + hard  # with constraints a column for the residual
-        check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
+        kept = f"states and actions of a horizon of {horizon:,} steps"
+        check_memory(kept, n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
         self._launcher = Launcher(self._with_contact(scene, how), n, self.options)
         self._factors, self._forces = self._zeros(n, width) + 1, self._zeros(n, bodies, 6)
         self._start, self._g_start = self._zeros(slots, n, sum(self._widths)), self._zeros(n, sum(self._widths))
@@ -97,8 +99,7 @@ class Simulator:
         self.nonfinite_gradients, self.unconverged = self._zeros(2, n, dtype=torch.int32)
         self._rows: Any = None  # what backward needs of each substep, of all slots
         self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
-        self._slot, self._last = 0, horizon  # of the rollout's next differentiable step, of the last step
-        self._versions = [0] * horizon  # each slot serves a new step in each rollout
+        self._window, self._last = Window(horizon), horizon  # slot of the last step
 
     def _zeros(self, *size: int, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.zeros(size, dtype=dtype or self.dtype, device=self.device)
@@ -149,7 +150,7 @@ class Simulator:
             scene = self._with_contact(self.scene, how)
             self._launcher.rewrite(scene, ("contact_params", "row_params"), IMPEDANCE)
         self.integration, self.options = how, self.options._replace(integration=how)
-        self._versions = [version + 1 for version in self._versions]
+        self._window.forget()
 
     def _with_contact(self, scene: Scene, how: Integration) -> Scene:
         """Return a copy with MuJoCo's constraints, or the scene itself on soft contact, if it supports the scene."""
@@ -187,14 +188,7 @@ class Simulator:
                     self._check_given(name, given, *given.shape[1:])
         start = (qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
         if torch.is_grad_enabled() and any(part.requires_grad for part in start):
-            if self._slot == self.horizon:
-                raise RuntimeError(
-                    f"horizon of {self.horizon} differentiable steps exceeded: begin a new rollout by an environment's "
-                    "detach() or a simulator's rewind(), step under torch.no_grad(), or make it with a larger horizon"
-                )
-            slot, self._slot = self._slot, self._slot + 1
-            self._versions[slot] += 1
-            both = ControlStep.apply(self, slot, *start)
+            both = ControlStep.apply(self, self._window.take(), *start)
         else:
             both = self._forward(self.horizon, *start)
         end: State = both.split(self._widths[:2], dim=1)
@@ -217,18 +211,18 @@ class Simulator:
         rotation vector in the body's frame. Arguments are as for `step`. The rollout must have room for a step. Rows of
         `nonfinite` environments are zero.
         """
-        leaves, slot = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._slot
+        leaves, used = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._window.used
         with torch.enable_grad():
             end = torch.cat(self.step(*leaves), dim=1)
         cotangents = self.tangent.left_inverse(end.detach()).unbind(1)
         rows = [torch.autograd.grad(end, leaves, row, retain_graph=True) for row in cotangents]
-        self._slot = slot
+        self._window.used = used
         g_qpos, g_qvel, B = (torch.stack(part, dim=1) for part in zip(*rows, strict=True))
         return torch.cat((g_qpos, g_qvel), dim=2) @ self.tangent.basis(torch.cat(leaves[:2], dim=1).detach()), B
 
     def rewind(self) -> None:
         """Begin a new rollout of differentiable steps."""
-        self._slot = 0
+        self._window.used = 0
 
     def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
         key = (kernel, slot)
@@ -300,7 +294,7 @@ class ControlStep(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, sim: Simulator, slot: int, *start: torch.Tensor) -> torch.Tensor:
-        ctx.sim, ctx.slot, ctx.version = sim, slot, sim._versions[slot]
+        ctx.sim, ctx.slot, ctx.version = sim, slot, sim._window.version(slot)
         return sim._forward(slot, *start)
 
     @staticmethod
@@ -311,11 +305,7 @@ class ControlStep(torch.autograd.Function):
                 "a simulated step has a first derivative only, so no create_graph=True: take finite differences of it"
             )
         sim = ctx.sim
-        if sim._versions[ctx.slot] != ctx.version:
-            raise RuntimeError(
-                f"backward through a control step whose checkpoint was overwritten: at most {sim.horizon} "
-                "differentiable steps can be alive; build the simulator with a larger horizon"
-            )
+        sim._window.check(ctx.slot, ctx.version)
         try:
             sim._g_end.copy_(g_end)
         except RuntimeError as error:  # is_grads_batched

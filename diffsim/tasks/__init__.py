@@ -61,6 +61,8 @@ def find_task(name: str | type[Task]) -> type[Task]:
     if FILE.fullmatch(str(name)):
         return pkgutil.resolve_name(OWN_TASK)(name)
     base, options = base_name(str(name)), str(name).partition(":")[2]
+    if base.endswith(".xml"):
+        raise TaskError(f"{base} is a robot without a task: give a file with a class, my_task.py (docs/own_robot.md)")
     if base not in TASKS:
         raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
     return TASKS[base] if name == base else TASKS[base].configured(options)

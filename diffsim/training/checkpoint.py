@@ -111,18 +111,6 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def find_nonfinite(learner: Learner) -> str | None:
-    """The first weight that is not finite, if any. Frozen ones may be infinite: log_std of a policy without noise."""
-    for owner, module in (parts(learner) | {"policy": learner.policy}).items():
-        for name, weight in (
-            (*module.named_parameters(), *module.named_buffers()) if isinstance(module, nn.Module) else ()
-        ):
-            frozen = isinstance(weight, nn.Parameter) and not weight.requires_grad
-            if bool((weight.isnan() if frozen else ~weight.isfinite()).any()):
-                return f"{owner}.{name}"
-    return None
-
-
 def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, Any]:
     """The checkpoint at path, or of the run whose folder that is, whole, of this format and of the script if one is
     named; else raises ValueError."""

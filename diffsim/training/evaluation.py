@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import json
 import pkgutil
 from collections.abc import Callable
@@ -21,9 +20,10 @@ import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.training import checkpoint, graph
-from diffsim.training.directory import check_writable, say
+from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
+from diffsim.training.log import say
 
 GAIT = "diffsim_cli.gait:report"
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
@@ -166,7 +166,7 @@ def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, see
     options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
     options["threads"] = args.threads or None
     try:
-        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options | others)
+        return diffsim.make(args.task_class, num_envs, args.device, seed, horizon, **options | others)
     except ValueError as error:
         fail(error)
 
@@ -210,8 +210,9 @@ def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluatio
     """
     if not evaluation.compared:
         return {}
-    own, substeps = evaluation.returns.median().item(), FINER * args.substeps
-    value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
+    own, substeps, finer = evaluation.returns.median().item(), FINER * args.substeps, copy.copy(args)
+    finer.substeps, finer.implicit = substeps, False
+    value = measure(finer).returns.median().item()
     share = kept(own, value)
     say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{_warning(share, 'more substeps')}")
     found = {"finer": {"substeps": substeps, "return": value, "kept": share}}

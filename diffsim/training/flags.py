@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import torch
 import tyro
 
-from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
+from diffsim.tasks import FILE, TASKS, Accuracy, Contact, Task, base_name, find_task
 from diffsim.training import checkpoint
 from diffsim.training.errors import fail, in_one_line
 from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, flag
@@ -76,10 +77,15 @@ class Flags:
         """The task's name without options: tables of defaults are by it."""
         return base_name(self.env)
 
+    @functools.cached_property
+    def task_class(self) -> type[Task]:
+        """The task: a file's code runs once, and options are read once."""
+        return find_task(self.env)
+
     @property
     def like(self) -> str:
         """The name of the task whose settings it begins with: Task.like, or its own."""
-        like = find_task(self.env).like
+        like = self.task_class.like
         return self.task if like is None else find_task(like).name
 
     def task_defaults(self) -> dict[str, Any]:
@@ -95,7 +101,7 @@ class Flags:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
         if self.contact != "mujoco" and any(self.onset):
             fail(f"--onset is for --contact mujoco, and the contact is {self.contact}")
-        if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
+        if getattr(self, "symmetric", False) and not self.task_class.has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
 
     @classmethod
@@ -129,9 +135,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         except (AttributeError, KeyError, TypeError) as error:
             fail(f"{path} is damaged: {error}")
     else:
-        task = find_task(args.env)
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
-            args.contact = task.contact
+            args.contact = args.task_class.contact
         defaults = dataclasses.replace(
             kind(), contact=args.contact, **(_presets(args) | args.task_defaults() | _of_task(args))
         )
@@ -146,7 +151,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 def _presets(args: Flags) -> dict[str, Any]:
     """Look up what --accuracy and --contact stand for."""
     try:
-        how = find_task(args.env).integration(args.accuracy, args.contact)
+        how = args.task_class.integration(args.accuracy, args.contact)
     except ValueError as error:
         fail(error)
     onset = {} if how.contact == "mujoco" else {"onset": (0.0, 0.0)}
@@ -155,7 +160,7 @@ def _presets(args: Flags) -> dict[str, Any]:
 
 def _of_task(args: Flags) -> dict[str, Any]:
     """Look up the defaults that the task sets for this script, on this device."""
-    task, script, device = find_task(args.env), args.script(), "cpu" if args.device == "cpu" else "gpu"
+    task, script, device = args.task_class, args.script(), "cpu" if args.device == "cpu" else "gpu"
     values = {"symmetric": task.symmetric} if hasattr(args, "symmetric") else {}
     if wrong := [key for key, given in task.defaults.items() if not isinstance(given, Mapping)]:
         fail(f"task {args.env!r}: defaults are by script, such as {{'shac': {{'horizon': 16}}}}, not {wrong[0]!r}")

@@ -98,6 +98,8 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
             "--env walker --accuracy fast",
             "task 'walker' has no preset 'fast' on soft contact; choose from default, accurate",
         ),
+        ("--env my/robot.xml", "my/robot.xml is a robot without a task: give a file with a class, my_task.py"),
+        ("--env cartpole --horizon 500000000", "states and actions of a horizon of 500,000,000 steps would take"),
         ("--env cartpole:rough=10", "cartpole touches no ground, so it has no terrain"),
         ("--env ant:clip.npz", "task 'ant' has no option 'clip.npz': write rough=20, randomise=none or a range like"),
         ("--env humanoid_imitation:nowhere", "no such clip: nowhere; give an .npz or .csv file"),

@@ -1,6 +1,4 @@
-"""Contacts of a capsule with a parallel one, and with a box, as MuJoCo's (pair_list.py).
-
-Capsules that are all but parallel touch at both ends of the stretch along which they lie beside each other.
+"""Contacts of a capsule and a box of one environment, as MuJoCo's.
 
 A capsule touches a box as two spheres on its axis would: one at the axis' point nearest to the box, the other where the
 axis leaves the face or the edge there, or ends. If y + s h, |s| <= 1, is the axis in the frame of the box, s of either
@@ -12,221 +10,220 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.pairs.geometry import TINY, pair_geometry
-from diffsim.kernels.thread.model import functions, types
-from diffsim.kernels.thread.spatial import spatial
-from diffsim.kernels.thread.spec import KernelSpec
-from diffsim.kernels.thread.wide import blocks
+from diffsim.kernels.pairs.spheres import TINY, sphere_contacts
+from diffsim.kernels.pairs.touch import geom_types
+from diffsim.kernels.thread.model import functions, struct
 
 # In float64, as MuJoCo's, and in float32
-PARALLEL_SQ = 1e-8, 1e-6  # square of the sine between two parallel capsules
 SAME_SQ = 1e-15, 1e-9  # m^2, by which an edge must be nearer to a capsule than what was found before
 SKEW_SQ = 0.0, 1e-6  # square of the least sine between a capsule and an edge
-SURFACE = 1e-12, 1e-6  # m, of a sphere's centre from a box
 FAR = 1e10  # m
+INSIDE, FACE, EDGE, CORNER = range(4)  # what of a box is nearest to a capsule's axis
+WHOLE, SIDE = 1, 2  # a way along an axis of the box is at most as long as the box, or ends at its side
 
 
 @cache
-def capsule_contacts(spec: KernelSpec) -> SimpleNamespace:
-    """Make the functions of a capsule's contacts."""
-    t, sp, geometry, single = types(spec), spatial(spec), pair_geometry(spec), int(types(spec).U == wp.float32)
-    T, vec3, vec4, block, force_at, join = t.T, t.vec3, t.vec4, blocks(spec), sp.force_at, sp.join
-    Model, Links, Contacts, pick = t.Model, t.Links, t.Contacts, block.pick
-    less, sign, signs, shifted, blend = (getattr(geometry, name) for name in "less sign signs shifted blend".split())
-    parallel_sq, same_sq, skew_sq, surface = (each[single] for each in (PARALLEL_SQ, SAME_SQ, SKEW_SQ, SURFACE))
+def capsule_contacts(U: type) -> SimpleNamespace:
+    """Make the functions for numbers of this type."""
+    t, spheres = geom_types(U), sphere_contacts(U)
+    vec3, Geom, Touches = t.vec3, t.Geom, t.Touches
+    same_sq, skew_sq = (each[int(U == wp.float32)] for each in (SAME_SQ, SKEW_SQ))
+    Feature = struct(
+        "Feature",
+        {
+            "kind": int,  # INSIDE, FACE, EDGE or CORNER
+            "axis": int,  # normal to the face, or along the edge
+            "s": U,  # of the point on the capsule's axis
+            "point": vec3,  # on the box, of an edge or a corner
+            "corner": vec3,  # whose signs are those of the nearest corner
+        },
+    )
+    # A point s on the capsule's axis, and how it moves
+    Place = struct("Place", {"s": U, "by_y": vec3, "by_h": vec3})
 
     @wp.func
-    def place_parallel(m: Model, s: int, end: int, links: Links, contacts: Contacts):
-        """Place the two contacts of parallel capsules, or one where they are not."""
-        touch = geometry.nearest_points(m, s, links)
-        x1, a1, x2, a2, s1, s2 = touch.x1, touch.a1, touch.x2, touch.a2, touch.s1, touch.s2
-        ma = wp.dot(a1, a1)
-        mb = wp.dot(a1, a2)
-        mc = wp.dot(a2, a2)
-        parallel = less(ma * mc - mb * mb, T(parallel_sq) * ma * mc)
+    def nearest_feature(y: vec3, h: vec3, b: vec3):
+        """Find what of a box with the half lengths b is nearest to a capsule's axis."""
+        feature = Feature()
+        best = U(FAR)
         for k in range(2):
-            e = T(2.0 * float(k) - 1.0)  # the end of the first capsule, or that of the second one which lies before it
-            f = e * sign(mb)
-            at = (wp.dot(a1, x2 - x1) + f * mb) / ma
-            own = (wp.dot(a2, x1 - x2) + e * mb) / mc
-            inner = less(e * at, T(1.0))
-            touch.s1 = pick(T(0.5), parallel, pick(T(0.5), inner, geometry.clamped(at), e), s1)
-            touch.s2 = pick(T(0.5), parallel, pick(T(0.5), inner, f, geometry.clamped(own)), s2)
-            touch.d = (x2 + touch.s2 * a2) - (x1 + touch.s1 * a1)
-            contacts[end + k].how = vec4(touch.s1, touch.s2, T(0.0), T(0.0))
-            geometry.place_touch(m, s, end + k, touch, contacts)
-        contacts[end + 1].active = parallel * contacts[end + 1].active
-
-    @wp.func
-    def parallel_adjoint(m: Model, c: int, links: Links, contacts: Contacts, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
-        """Return the wrench of a contact, see pair_list.contact_adjoint."""
-        s = contacts[c].row
-        touch = geometry.segments(m, s, links)
-        touch.s1 = contacts[c].how[0]
-        touch.s2 = contacts[c].how[1]
-        touch.d = (touch.x2 + touch.s2 * touch.a2) - (touch.x1 + touch.s1 * touch.a1)
-        return geometry.touch_adjoint(m, s, links, touch, n, g_p, g_r, g_n)
-
-    @wp.func
-    def nearest_to_box(y: vec3, h: vec3, b: vec3):
-        """Find the point of a capsule's axis that is nearest to a box with half lengths b.
-
-        Returns:
-            s; marks of the box's axes along which an end is outside, if that is nearest to a face or inside; 1 if it is
-            nearest to an edge, else 0; a mark of the edge's axis; the edge's point; 1 between its ends, else 0; the
-            signs of its corner.
-        """
-        best = T(FAR)
-        s = T(0.0)
-        outside = vec3()
-        for k in range(2):
-            e = T(2.0 * float(k) - 1.0)
-            beyond = wp.abs(y + e * h) - b
-            out = vec3()
+            end = U(2.0 * float(k) - 1.0)
+            square = U(0.0)
+            outside = int(0)
+            axis = int(0)
             for i in range(3):
-                out[i] = less(T(0.0), beyond[i])
-                beyond[i] = wp.max(beyond[i], T(0.0))
-            square = wp.dot(beyond, beyond)
-            nearer = less(square, best) * less(out[0] + out[1] + out[2], T(1.5))
-            best = pick(T(0.5), nearer, square, best)
-            s = pick(T(0.5), nearer, e, s)
-            outside = blend(nearer, out, outside)
-        on_edge = T(0.0)
-        along = vec3()
-        corner = vec3()
-        inner = T(0.0)
-        sigma = vec3()
+                beyond = wp.abs(y[i] + end * h[i]) - b[i]
+                if beyond > U(0.0):
+                    square = square + beyond * beyond
+                    outside = outside + 1
+                    axis = i
+            if outside < 2 and square < best:
+                best = square
+                feature.kind = outside  # INSIDE or FACE
+                feature.axis = axis
+                feature.s = end
         hh = wp.dot(h, h)
-        for k in range(12):
-            j = k // 4
-            e_j = vec3()
-            e_j[j] = T(1.0)
-            centre = b - b[j] * e_j
-            centre[(j + 1) % 3] = b[(j + 1) % 3] * T(1.0 - 2.0 * float(k % 2))
-            centre[(j + 2) % 3] = b[(j + 2) % 3] * T(1.0 - 2.0 * float(k // 2 % 2))
-            at, on_axis, d = geometry.nearest(centre, b[j] * e_j, y, h)
-            square = wp.dot(d, d)
-            det = b[j] * b[j] * (hh - h[j] * h[j])
-            skew = less(wp.max(T(TINY), T(skew_sq) * b[j] * b[j] * hh), det)
-            nearer = less(square, best - T(same_sq)) * skew
-            best = pick(T(0.5), nearer, square, best)
-            s = pick(T(0.5), nearer, on_axis, s)
-            on_edge = wp.max(on_edge, nearer)
-            along = blend(nearer, e_j, along)
-            corner = blend(nearer, centre + (at * b[j]) * e_j, corner)
-            # MuJoCo counts the point as a corner, too, if the nearest points of both lines are beyond it
-            line = b[j] * (hh * (y[j] - centre[j]) - h[j] * wp.dot(h, y - centre))
-            inside = less(wp.abs(at), T(1.0))
-            inner = pick(T(0.5), nearer, inside * less(wp.abs(line), det), inner)
-            centre[j] = pick(T(0.5), inside, line, at)
-            sigma = blend(nearer, signs(centre), sigma)
-        return s, outside, on_edge, along, corner, inner, sigma
+        for j in range(3):
+            low = int(0)  # the first of the two other axes: of equally near edges MuJoCo has the first in this order
+            if j == 0:
+                low = 1
+            along = vec3()
+            along[j] = b[j]
+            det = b[j] * b[j] * hh - b[j] * h[j] * (b[j] * h[j])
+            skew = det > wp.max(U(TINY), U(skew_sq) * b[j] * b[j] * hh)
+            for k in range(4):
+                middle = b - along
+                if k % 2 == 0:
+                    middle[low] = -b[low]
+                if k < 2:
+                    middle[3 - j - low] = -b[3 - j - low]
+                # the axis is at least as far from this edge as the box around it
+                gap = middle - y
+                bound = U(0.0)
+                for i in range(3):
+                    beyond = wp.max(wp.abs(gap[i]) - wp.abs(h[i]) - along[i], U(0.0))
+                    bound = bound + beyond * beyond
+                if skew and bound < best - U(same_sq):
+                    # nearest points middle + at along and y + s h; it is a corner, too, if both lines' are beyond it
+                    u = -b[j] * gap[j]
+                    v = wp.dot(h, gap)
+                    at = (hh * u + b[j] * h[j] * v) / det
+                    s = (b[j] * b[j] * v + b[j] * h[j] * u) / det
+                    kind = int(EDGE)
+                    side = at
+                    if wp.abs(at) > U(1.0):
+                        kind = int(CORNER)
+                        at = wp.sign(at)
+                        s = (v + at * b[j] * h[j]) / hh
+                    if wp.abs(s) > U(1.0):
+                        s = wp.sign(s)
+                        at = (u + s * b[j] * h[j]) / (b[j] * b[j])
+                        if wp.abs(at) > U(1.0):
+                            kind = int(CORNER)
+                            side = at
+                            at = wp.sign(at)
+                    d = gap + at * along - s * h
+                    if wp.dot(d, d) < best - U(same_sq):
+                        best = wp.dot(d, d)
+                        feature.kind = kind
+                        feature.axis = j
+                        feature.s = s
+                        feature.point = middle + at * along
+                        feature.corner = middle
+                        feature.corner[j] = side
+        return feature
 
     @wp.func
-    def way_over_box(h: vec3, s: T, outside: vec3, on_edge: T, along: vec3, inner: T, sigma: vec3):
+    def first_place(feature: Feature, y: vec3, h: vec3):
+        """Return the point of a capsule's axis that is nearest to the box."""
+        place = Place()
+        place.s = feature.s
+        if feature.kind >= EDGE and wp.abs(feature.s) < U(1.0):
+            across = h
+            gap = feature.point - y - feature.s * h
+            if feature.kind == EDGE:
+                across[feature.axis] = U(0.0)
+                gap[feature.axis] = U(0.0)
+            scale = U(1.0) / wp.max(wp.dot(across, across), U(TINY))
+            place.by_y = -scale * across
+            place.by_h = feature.s * place.by_y + scale * gap
+        return place
+
+    @wp.func
+    def way_over_box(feature: Feature, h: vec3):
         """Choose the way along a capsule's axis from the point nearest to a box to the other contact.
 
         Returns:
-            its direction, or 0 if there is none; marks of the box's axes along which it ends at a side of the box, and
-            of those along which it is at most as long as the box.
+            its direction, 1 or -1, or 0 if there is none; and for each axis of the box what ends it: WHOLE, SIDE or 0.
         """
-        ones = vec3(T(1.0), T(1.0), T(1.0))
-        differs = vec3()  # axes along which the capsule's direction and the corner differ in sign
+        way = U(0.0)
+        ends = wp.vec3i(0, 0, 0)
+        if feature.kind == FACE:
+            way = -feature.s
+            ends = wp.vec3i(SIDE, SIDE, SIDE)
+            ends[feature.axis] = 0
+        if feature.kind < EDGE:
+            return way, ends
+        differs = wp.vec3i(0, 0, 0)  # 1 of axes along which the capsule's direction and the corner differ in sign
         for i in range(3):
-            differs[i] = less(-sign(-h[i]) * sigma[i], T(0.0))
+            if (h[i] > U(0.0)) != (feature.corner[i] >= U(0.0)):
+                differs[i] = 1
+        if feature.kind == EDGE:  # over the face that is less steep
+            differs[feature.axis] = 0
+            main = (feature.axis + 2) % 3
+            if wp.abs(h[main]) < wp.abs(h[(feature.axis + 1) % 3]):
+                main = (feature.axis + 1) % 3
+            if differs[0] + differs[1] + differs[2] == 1:
+                way = U(2.0 * float(differs[main]) - 1.0)
+                ends[main] = WHOLE
+                ends[feature.axis] = SIDE
+            return way, ends
         # from a corner along the edge whose axis is the odd one out, or over the face of the other two
-        count = wp.dot(differs, ones)
-        two = less(T(1.5), count)
-        odd = blend(two, ones - differs, differs)
-        slant = wp.dot(odd, h)
-        over_edge = less(T(0.5) * wp.dot(h, h), slant * slant)
-        from_corner = on_edge * (T(1.0) - inner) * less(T(0.5), count) * less(count, T(2.5))
-        corner_way = (T(1.0) - T(2.0) * two) * (T(2.0) * over_edge - T(1.0))
-        # from an edge over the face that is less steep
-        third = shifted(along)
-        main = shifted(third)
-        main = blend(less(wp.abs(wp.dot(main, h)), wp.abs(wp.dot(third, h))), third, main)
-        count = wp.dot(differs, ones - along)
-        from_edge = on_edge * inner * less(T(0.5), count) * less(count, T(1.5))
-        edge_way = T(2.0) * wp.dot(differs, main) - T(1.0)
-        # from an end over a face
-        way = -s * wp.max(outside[0], wp.max(outside[1], outside[2]))
-        way = pick(T(0.5), on_edge, from_corner * corner_way + from_edge * edge_way, way)
-        sides = blend(on_edge, from_edge * along, ones - outside)
-        return way, sides, from_corner * blend(over_edge, odd, ones - odd) + from_edge * main
+        count = differs[0] + differs[1] + differs[2]
+        if count == 1 or count == 2:
+            odd = int(0)
+            for i in range(1, 3):
+                if (differs[i] == 1) == (count == 1):
+                    odd = i
+            way = U(3.0 - 2.0 * float(count))
+            if h[odd] * h[odd] > U(0.5) * wp.dot(h, h):
+                ends[odd] = WHOLE
+            else:
+                way = -way
+                ends = wp.vec3i(WHOLE, WHOLE, WHOLE)
+                ends[odd] = 0
+        return way, ends
 
     @wp.func
-    def end_of_way(y: vec3, h: vec3, b: vec3, s: T, g_y: vec3, g_h: vec3, way: T, sides: vec3, steps: vec3):
-        """Return s, ds/dy and ds/dh at the end of the way over the box, of those at its beginning."""
-        length = T(1.0) - way * s
-        end_y = vec3()
-        end_h = vec3()
-        q = y + s * h
+    def second_place(first: Place, y: vec3, h: vec3, b: vec3, way: U, ends: wp.vec3i):
+        """Return the point of a capsule's axis where the way over the box ends that begins at the first place."""
+        place = Place()
+        length = U(1.0) - way * first.s
+        q = y + first.s * h
         for i in range(3):
-            e_i = vec3()
-            e_i[i] = T(1.0)
-            inv_h = sign(h[i]) / wp.max(wp.abs(h[i]), T(TINY))
-            step = pick(T(0.5), steps[i], T(2.0) * b[i] * wp.abs(inv_h), T(FAR))
-            step = pick(T(0.5), sides[i], (b[i] - way * sign(h[i]) * q[i]) * wp.abs(inv_h), step)
-            shorter = less(step, length)
-            length = wp.min(length, step)
-            end_y = blend(shorter, steps[i] * g_y - (sides[i] * inv_h) * e_i, end_y)
-            end_h = blend(shorter, steps[i] * g_h - ((sides[i] * s + way * step) * inv_h) * e_i, end_h)
-        return s + way * length, end_y, end_h
+            inv_h = wp.sign(h[i]) / wp.max(wp.abs(h[i]), U(TINY))
+            if ends[i] == WHOLE:
+                step = U(2.0) * b[i] * wp.abs(inv_h)
+                if step < length:
+                    length = step
+                    place.by_y = first.by_y
+                    place.by_h = first.by_h
+                    place.by_h[i] = place.by_h[i] - way * step * inv_h
+            if ends[i] == SIDE:
+                step = (b[i] - way * wp.sign(h[i]) * q[i]) * wp.abs(inv_h)
+                if step > U(0.0) and step < length:  # a capsule that begins at the side goes on along it
+                    length = step
+                    place.by_y = vec3()
+                    place.by_y[i] = -inv_h
+                    place.by_h = (first.s + way * step) * place.by_y
+        place.s = first.s + way * length
+        return place
 
     @wp.func
-    def place_capsule_box(m: Model, s: int, end: int, links: Links, contacts: Contacts):
-        """Place the contacts of a capsule and a box; returns how many blocks have one in some environment."""
-        capsule = geometry.segments(m, s, links)
-        box = geometry.second_box(m, s, links)
-        reach = wp.length(capsule.a1) + T(m.row_shape[s][1]) + T(m.row_params[s][10])
-        if not block.any_of(geometry.reaches(capsule.x1, reach, box)):
-            return 0
-        y = wp.transpose(box.R) * (capsule.x1 - box.x)
-        h = wp.transpose(box.R) * capsule.a1
-        at, outside, on_edge, along, corner, inner, sigma = nearest_to_box(y, h, box.h)
-        way, sides, steps = way_over_box(h, at, outside, on_edge, along, inner, sigma)
-        across = vec3(T(1.0), T(1.0), T(1.0)) - inner * along
-        h_across = wp.cw_mul(across, h)
-        scale = on_edge * less(wp.abs(at), T(1.0)) / wp.max(wp.dot(h_across, h_across), T(TINY))
-        g_y = -scale * h_across
-        g_h = at * g_y + scale * wp.cw_mul(across, corner - y - at * h)
-        for k in range(2):
-            c = end + k
-            if k == 1:
-                at, g_y, g_h = end_of_way(y, h, box.h, at, g_y, g_h, way, sides, steps)
-            centre = capsule.x1 + at * capsule.a1
-            contacts[c].vertex = centre
-            contacts[c].a = box.R * g_y
-            contacts[c].b = box.R * g_h
-            touch = geometry.to_box(m, s, links, centre, box.x)
-            geometry.place_touch(m, s, c, touch, contacts)
-            # where the way begins to be over the box it may be on its surface: normal to the nearest face
-            q = y + at * h
-            face = geometry.largest(-wp.abs(box.h - wp.abs(q)))
-            n = -(box.R * wp.cw_mul(face, signs(q)))
-            on_surface = less(wp.length(touch.d), T(surface))
-            geometry.set_normal(c, n, on_surface, contacts)
-            contacts[c].how[0] = on_surface
-            contacts[c].p = blend(on_surface, centre + T(0.5) * T(m.row_shape[s][1]) * n, contacts[c].p)
-            contacts[c].q = contacts[c].p
-        contacts[end + 1].active = contacts[end + 1].active * wp.abs(way)
+    def touch_at(place: Place, capsule: Geom, box: Geom):
+        """Return the contact of the sphere at a place on the capsule's axis, with ds/dy and ds/dh in the world."""
+        centre = capsule.x + place.s * spheres.half_axis(capsule)
+        touch = spheres.sphere_box(centre, capsule.size[0], box)
+        touch.a = box.R * place.by_y
+        touch.b = box.R * place.by_h
+        return touch
+
+    @wp.func
+    def capsule_box(capsule: Geom, box: Geom, margin: U, found: Touches):
+        """Find the contacts of a capsule and a box, none if they are clearly apart; returns their number."""
+        y = wp.transpose(box.R) * (capsule.x - box.x)
+        h = capsule.size[1] * (wp.transpose(box.R) * spheres.column(capsule.R, 2))
+        reach = capsule.size[0] + margin
+        for i in range(3):
+            if wp.abs(y[i]) - wp.abs(h[i]) - box.size[i] > reach:
+                return 0
+        feature = nearest_feature(y, h, box.size)
+        first = first_place(feature, y, h)
+        found[0] = touch_at(first, capsule, box)
+        way, ends = way_over_box(feature, h)
+        if way == U(0.0):
+            return 1
+        found[1] = touch_at(second_place(first, y, h, box.size, way, ends), capsule, box)
         return 2
-
-    @wp.func
-    def capsule_box_adjoint(m: Model, c: int, links: Links, contacts: Contacts, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
-        """Return the wrench of a contact, see pair_list.contact_adjoint."""
-        s = contacts[c].row
-        z = contacts[c].vertex
-        capsule = geometry.segments(m, s, links)
-        wrench = geometry.touch_adjoint(m, s, links, geometry.to_box(m, s, links, z, capsule.x2), n, g_p, g_r, g_n)
-        # on the surface
-        g_z = g_r + T(0.5) * wp.dot(n, g_p)
-        turn = wp.cross(n, g_n + T(0.5) * T(m.row_shape[s][1]) * g_p)
-        wrench = geometry.blend_wrenches(contacts[c].how[0], force_at(z, g_z * n) + join(turn, vec3()), wrench)
-        # as s moves
-        g_s = wp.dot(g_p - wp.spatial_bottom(wrench), capsule.a1)
-        wrench = wrench - force_at(capsule.x1, g_s * contacts[c].a)
-        return wrench - join(g_s * wp.cross(capsule.a1, contacts[c].b), vec3())
 
     return functions(locals())

@@ -10,26 +10,22 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.mujoco.ground import UNSOLVED
-from diffsim.kernels.pairs.boxes import box_contacts
-from diffsim.kernels.pairs.capsules import capsule_contacts
-from diffsim.kernels.pairs.geometry import pair_geometry
+from diffsim.kernels.pairs.equality import equality_rows
+from diffsim.kernels.pairs.geoms import pair_geoms
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
-from diffsim.robot.pairs import BOXES, CAPSULE_BOX, PARALLEL
 
 
 @cache
-def pair_list(spec: KernelSpec) -> SimpleNamespace:
-    """Make the functions that place and list blocks of rows."""
-    t, sp, block, geometry, sizes = types(spec), spatial(spec), blocks(spec), pair_geometry(spec), spec.pair_sizes
+def pair_list(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
+    """Make the functions that place and list blocks of rows, with or without what only their adjoint needs."""
+    t, sp, block, equality, sizes = types(spec), spatial(spec), blocks(spec), equality_rows(spec), spec.pair_sizes
     T, U, vec3, Model, Lane, Links, Contacts = t.T, t.U, t.vec3, t.Model, t.Lane, t.Links, t.Contacts
     FLOATING, WORLD, BLOCK, TOUCH = spec.floating, spec.room - 1, spec.block, "geoms_rows" in spec.features
-    EQUALITIES, HEADS, NPOINTS, LAST = sizes.equalities, sizes.heads, sizes.points, sizes.last
-    PARALLELS, CAPSULE_BOXES, TWO_BOXES = spec.has("parallel_geoms capsule_box_geoms box_geoms")
-    capsules = capsule_contacts(spec) if PARALLELS or CAPSULE_BOXES else None
-    boxes = box_contacts(spec) if TWO_BOXES else None
+    EQUALITIES, HEADS, PLACES, LAST = sizes.equalities, sizes.heads, sizes.places, sizes.last
+    geoms = pair_geoms(spec, adjoint) if TOUCH else None
 
     @wp.func
     def place_world(links: Links, origin: vec3):
@@ -37,48 +33,6 @@ def pair_list(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(FLOATING):
             links[WORLD].R = wp.identity(3, dtype=T)
             links[WORLD].x = -origin
-
-    @wp.func
-    def place_contacts(m: Model, s: int, end: int, links: Links, contacts: Contacts):
-        """Place the contacts of the two geoms with the first row s in the elements from `end` on; returns how many."""
-        number = int(1)
-        contacts[end].row = s
-        kind = m.row_shape[s][9]
-        if wp.static(TWO_BOXES):
-            if kind == U(BOXES):
-                number = boxes.place_boxes(m, s, end, links, contacts)
-        if wp.static(PARALLELS):
-            if kind == U(PARALLEL):
-                number = int(2)
-                capsules.place_parallel(m, s, end, links, contacts)
-        if wp.static(CAPSULE_BOXES):
-            if kind == U(CAPSULE_BOX):
-                number = capsules.place_capsule_box(m, s, end, links, contacts)
-        if m.row_partner[s] == s:
-            geometry.place_touch(m, s, end, geometry.nearest_points(m, s, links), contacts)
-        for k in range(1, number):
-            contacts[end + k].row = m.row_partner[s] + k - 1
-        return number
-
-    @wp.func
-    def contact_adjoint(m: Model, c: int, links: Links, contacts: Contacts, n: vec3, g_p: vec3, g_r: T, g_n: vec3):
-        """Return the adjoint of the second link's pose beside a first one that stays, as a wrench.
-
-        Those of the contact's point are g_p, of its distance g_r, of its normal n g_n. It moves rigidly with both links
-        together, so that the first one's wrench follows (pair_adjoint.py).
-        """
-        kind = m.row_shape[contacts[c].row][9]
-        if wp.static(TWO_BOXES):
-            if kind == U(BOXES):
-                return boxes.boxes_adjoint(m, c, contacts, n, g_p, g_r, g_n)
-        if wp.static(PARALLELS):
-            if kind == U(PARALLEL):
-                return capsules.parallel_adjoint(m, c, links, contacts, n, g_p, g_r, g_n)
-        if wp.static(CAPSULE_BOXES):
-            if kind == U(CAPSULE_BOX):
-                return capsules.capsule_box_adjoint(m, c, links, contacts, n, g_p, g_r, g_n)
-        s = contacts[c].row
-        return geometry.touch_adjoint(m, s, links, geometry.nearest_points(m, s, links), n, g_p, g_r, g_n)
 
     @wp.func
     def depth_of(c: int, contacts: Contacts):
@@ -119,21 +73,22 @@ def pair_list(spec: KernelSpec) -> SimpleNamespace:
         contacts[last].D = T(0.0)
         equalities = int(EQUALITIES)  # not unrolled
         heads = int(HEADS)
-        points = int(NPOINTS)
+        places = int(PLACES)
         for s in range(equalities):
             contacts[end].row = s
-            geometry.place(m, end, links, contacts)
+            equality.place(m, end, links, contacts)
             end = end + 1
         if wp.static(TOUCH):
-            centres = wp.zeros(shape=NPOINTS, dtype=vec3)
-            for k in range(points):
-                i = m.point_link[k]
-                centres[k] = sp.on_link(links[i].R, links[i].x, m.point[k])
+            centres = wp.zeros(shape=PLACES, dtype=vec3)
+            for k in range(places):
+                i = m.place_link[k]
+                centres[k] = sp.on_link(links[i].R, links[i].x, m.place_point[k])
             for s in range(equalities, heads):
-                d = centres[m.row_points[2 * s + 1]] - centres[m.row_points[2 * s]]
-                if block.any_of(T(m.row_shape[s][0]) - wp.dot(d, d)):  # of their bounding spheres
+                d = centres[m.row_place[2 * s + 1]] - centres[m.row_place[2 * s]]
+                near = T(m.row_reach_sq[s]) - wp.dot(d, d)  # of their bounding spheres
+                if block.any_of(near):
                     begin = end
-                    number = place_contacts(m, s, end, links, contacts)
+                    number = geoms.place(m, s, near, end, links, contacts)
                     for k in range(number):
                         if block.any_of(contacts[begin + k].active):
                             end = keep(here, begin + k, end, contacts)

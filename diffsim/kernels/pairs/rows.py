@@ -1,12 +1,12 @@
 """Rows of MuJoCo's constraints between two bodies: equality and contacts. pair_adjoint.py has their adjoint.
 
-A row has J a = E' (A_j - A_i) of the links' accelerations (pair_geometry.py). Its force acts on both links, so
+A row has J a of the links' accelerations (jacobian.py). Its force acts on both links, so
 Newton's matrix leaves the tree, and conjugate gradients take part in each pass (pair_solver.py). They find the change
 of the rows' forces, which takes the place of -H s in the line search (newton.py). So that one accounts for their error.
 
 Equality has the force -D jar whatever its sign. Impedance and stiffness are those of the norm of its violation, which
 the two blocks of a weld share (MuJoCo's mj_instantiateEquality and mj_makeImpedance). Contacts of two geoms have the
-law of the ground's (constraint.py). The blocks that act are listed in each substep: without any, no time is spent.
+law of the ground's (ground.py). The blocks that act are listed in each substep: without any, no time is spent.
 """
 
 from functools import cache
@@ -17,7 +17,8 @@ import warp as wp
 from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
 from diffsim.kernels.mujoco.ground import pair_column
 from diffsim.kernels.mujoco.impedance import impedance_law
-from diffsim.kernels.pairs.geometry import pair_geometry
+from diffsim.kernels.pairs.equality import equality_rows
+from diffsim.kernels.pairs.jacobian import pair_jacobian
 from diffsim.kernels.pairs.listing import pair_list
 from diffsim.kernels.pairs.solver import row_solver
 from diffsim.kernels.thread.model import functions, types
@@ -33,14 +34,14 @@ ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterat
 @cache
 def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     """Make the rows' part of Newton's method."""
-    t, block, kin, geometry = types(spec), blocks(spec), kinematics(spec), pair_geometry(spec)
+    t, block, kin, J, equality = types(spec), blocks(spec), kinematics(spec), pair_jacobian(spec), equality_rows(spec)
     solver, sp, constraint = row_solver(spec, "Motions"), spatial(spec), impedance_law(spec)
     T, vec3, vec4, vec6, pick, join = t.T, t.vec3, t.vec4, t.vec6, block.pick, sp.join
     Model, Lane, Ck, Links, Contacts, Motions, Loads, Root, Newton = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Motions Loads Root Newton".split()
     )
     FLOATING, VARIED, WORLD = spec.floating, spec.varied, spec.room - 1
-    listed, LAST = pair_list(spec), spec.pair_sizes.last
+    listed, LAST = pair_list(spec, False), spec.pair_sizes.last
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
     COLUMN = pair_column(spec)  # of jar in the checkpoint
     JOINTS, TOUCH = spec.has("joint_rows geoms_rows")
@@ -58,11 +59,11 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def norm_of(m: Model, s: int, links: Links):
         """Return the block's violation, and the norm of that of its constraint as a vector along x."""
-        r = geometry.violation(m, s, links)
+        r = equality.violation(m, s, links)
         partner = m.row_partner[s]
         if partner == s:
             return r, r
-        other = geometry.violation(m, partner, links)
+        other = equality.violation(m, partner, links)
         return r, vec3(wp.sqrt(wp.dot(r, r) + wp.dot(other, other)), T(0.0), T(0.0))
 
     @wp.func
@@ -125,11 +126,11 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         end = listed.list_blocks(m, here, links, contacts)
         for c in range(here.begin, end):
             s = contacts[c].row
-            i, j = geometry.ends(m, s)
+            i, j = J.ends(m, s)
             D, rest = rest_of(m, here, c, links, contacts)
-            velocity = geometry.rates(m, c, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
+            velocity = J.rates(m, c, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
             jar = constants(m, here, s)[1] * velocity + rest
-            jar = jar + geometry.drift(m, c, links, contacts, motions[i].accel_link, motions[j].accel_link)
+            jar = jar + equality.drift(m, c, links, contacts, motions[i].accel_link, motions[j].accel_link)
             f, H = law(m, here, s, D, jar, T(1.0))
             contacts[c].D = D
             contacts[c].jar = jar
@@ -154,9 +155,9 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         """Turn the tree's Newton step into that with the rows between bodies."""
         if here.end > here.begin:
             for c in range(here.begin, here.end):
-                i, j = geometry.ends(m, contacts[c].row)
+                i, j = J.ends(m, contacts[c].row)
                 A, B = motions[i].A, motions[j].A
-                contacts[c].rate = geometry.rates(m, c, contacts, A, B, motions[i].u, motions[j].u)
+                contacts[c].rate = J.rates(m, c, contacts, A, B, motions[i].u, motions[j].u)
             solver.solve(m, here, links, contacts, motions, root.L, status.active, T(ACCURACY))
             for c in range(here.begin, here.end):
                 contacts[c].Hs = -contacts[c].change
@@ -176,8 +177,8 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
         total.error_sq = contacts[here.begin + LAST].D  # no solution where a contact has no room
         for c in range(here.begin, here.end):
             s = contacts[c].row
-            i, j = geometry.ends(m, s)
-            step_jar = geometry.rates(m, c, contacts, motions[i].A, motions[j].A, motions[i].u, motions[j].u)
+            i, j = J.ends(m, s)
+            step_jar = J.rates(m, c, contacts, motions[i].A, motions[j].A, motions[i].u, motions[j].u)
             jar = contacts[c].jar + alpha * step_jar
             f, H = law(m, here, s, contacts[c].D, jar, T(0.0))
             force_error = contacts[c].f - alpha * contacts[c].Hs - f

@@ -23,7 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.pairs.geometry import pair_geometry
+from diffsim.kernels.pairs.jacobian import pair_jacobian
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
@@ -38,7 +38,7 @@ ROUND_OFF = 1e-6
 @cache
 def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     """Make the conjugate gradients on branches, the array of structs ("Motions" or "Nodes") that has T's factor."""
-    t, block, geometry, tree = types(spec), blocks(spec), pair_geometry(spec), branch_solver(spec, array)
+    t, block, J, tree = types(spec), blocks(spec), pair_jacobian(spec), branch_solver(spec, array)
     T, vec3, mat6, pick, clear, solve_tree = t.T, t.vec3, t.mat6, block.pick, tree.clear, tree.solve_tree
     Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
     STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
@@ -47,8 +47,8 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     def spread(m: Model, c: int, contacts: Contacts, f: vec3, branches: Branches):
         """Add the rows' forces f to the right-hand side: to the links' bias forces, and to the joints' forces."""
         s = contacts[c].row
-        i, j = geometry.ends(m, s)
-        first, second = geometry.wrenches(m, c, contacts, f)
+        i, j = J.ends(m, s)
+        first, second = J.wrenches(m, c, contacts, f)
         branches[i].twist = branches[i].twist + first
         branches[j].twist = branches[j].twist - second
         if m.row_kind[s] == JOINT:
@@ -58,9 +58,9 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     @wp.func
     def rates_of(m: Model, c: int, contacts: Contacts, branches: Branches):
         s = contacts[c].row
-        i, j = geometry.ends(m, s)
+        i, j = J.ends(m, s)
         a, b = branches[i].twist, branches[j].twist
-        return geometry.rates(m, c, contacts, a, b, branches[i].rate, branches[j].rate)
+        return J.rates(m, c, contacts, a, b, branches[i].rate, branches[j].rate)
 
     @wp.func
     def solve(

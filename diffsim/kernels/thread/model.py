@@ -211,7 +211,7 @@ def struct(name: str, fields: dict[str, Any]) -> Any:
 @cache
 def scene_types(dtype: type, parts: tuple[str, ...]) -> SimpleNamespace:
     """Make Warp's vector types of a scene's numbers, and the struct Model of them with these parts' OPTIONAL_FIELDS."""
-    kinds: dict[str, Any] = {f"vec{n}": wp.types.vector(n, dtype) for n in (3, 4, 11)}
+    kinds: dict[str, Any] = {f"vec{n}": wp.types.vector(n, dtype) for n in (3, 4, 5, 11)}
     kinds |= {"real": dtype, "int": wp.int32, "mat3": wp.types.matrix((3, 3), dtype)}
     arrays = {f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()}
     arrays |= {f"{name}ss": wp.array2d(dtype=kind) for name, kind in kinds.items()}

@@ -7,24 +7,28 @@ import numpy as np
 
 from diffsim.kernels.thread.spec import KernelSpec
 
-# Fields of Model with rows between bodies (robot/pairs.py), as FIELDS of model.py
+# Fields of Model with rows between bodies (robot/pairs.py), as FIELDS of model.py; those of ends have two elements of a
+# block, its first and its second end
 PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    name: (kind, lambda n, name=name: getattr(n.scene.pairs, name[4:]))
+    f"row_{name}": (kind, lambda n, name=name: getattr(n.scene.pairs, name))
     for name, kind in (
-        ("row_kind", "ints"),  # of each block
-        ("row_partner", "ints"),  # the block that shares its violation, or itself
-        ("row_params", "vec11s"),  # as rows of robot.constants.Constraints
-        ("row_shape", "vec11s"),  # numbers of a joint's polynomial, of a weld or of two geoms
-        ("row_first", "vec3s"),  # m, the point on the first link, in its frame
-        ("row_second", "vec3s"),  # m, on the second one
-        ("row_first_frame", "mat3s"),  # the orientation that a weld compares, in the frame of the first link
-        ("row_second_frame", "mat3s"),  # of the second one
+        ("kind", "ints"),  # of each block
+        ("touch", "ints"),  # kind of two geoms
+        ("partner", "ints"),  # the block that shares its violation, or itself
+        ("params", "vec11s"),  # as rows of robot.constants.Constraints
+        ("polycoef", "vec5s"),  # of a joint
+        ("torquescale", "reals"),  # of a turn
+        ("reach_sq", "reals"),  # m^2, square of the distance of two geoms' centres within which they may touch
     )
 }
-PAIR_FIELDS["row_points"] = "ints", lambda n: n.scene.pairs.points[1].flat  # first and second, in the following two
-PAIR_FIELDS["point_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.points[0][:, 0])
-PAIR_FIELDS["point"] = "vec3s", lambda n: n.scene.pairs.points[0][:, 1:]  # m, in the link's frame
-PAIR_FIELDS["row_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.link).flat  # slots of the first and the second
+PAIR_FIELDS["row_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.link).flat  # slot of each end's link
+PAIR_FIELDS["row_ref"] = "reals", lambda n: n.scene.pairs.ref.flat  # q_0 of its joint
+PAIR_FIELDS["row_point"] = "vec3s", lambda n: n.scene.pairs.point.reshape(-1, 3)  # m, in its link's frame
+PAIR_FIELDS["row_frame"] = "mat3s", lambda n: n.scene.pairs.frame.reshape(-1, 3, 3)  # orientation, in that frame
+PAIR_FIELDS["row_size"] = "vec3s", lambda n: n.scene.pairs.size.reshape(-1, 3)  # m, of a geom as MuJoCo's
+PAIR_FIELDS["row_place"] = "ints", lambda n: n.scene.pairs.places[1].flat  # of each end, in the following two
+PAIR_FIELDS["place_link"] = "ints", lambda n: slots_of(n, n.scene.pairs.places[0][:, 0])
+PAIR_FIELDS["place_point"] = "vec3s", lambda n: n.scene.pairs.places[0][:, 1:]  # m, in the link's frame
 # Fields of Model with actuators on fixed tendons or at sites (robot/actuator.py); such scenes have one lane
 TRANSMISSION_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     name: (kind, lambda n, field=field: getattr(n.scene.transmissions, field))
@@ -150,33 +154,11 @@ def add_constraints(
             "begin": int,  # the first block's element of contacts
             "end": int,  # the element after the last block that acts in the substep
         }
+        if "geoms_rows" in spec.features:
+            structs["Contact"] |= {"how": vec4}  # of two geoms, as Touch, here and below
         if spec.pair_sizes.most > 1:
-            structs["Contact"] |= {  # see capsule_contacts.py and box_contacts.py
-                # a corner of a clipped face, the point on the edge of the first box, or that on a capsule's axis, s
-                "vertex": vec3,
-                "a": vec3,  # of a corner; half the edge of the first box; ds/dy
-                "b": vec3,  # of a corner; half the edge of the second box; ds/dh
-                # Of parallel capsules s_1 and s_2. Of two boxes: 1 for two edges; 1 for a face of the first box;
-                # `kept` of a corner, or 1 where the first edge's point is free to move; 1 where the second one's is
-                "how": vec4,
-            }
+            structs["Contact"] |= {"z": vec3, "a": vec3, "b": vec3}
     if spec.branched:
-        # Two geoms and their nearest points: x + s a of a sphere or a capsule's axis, or one of a box
-        structs["Touch"] = {
-            "x1": vec3,  # centre of the first geom
-            "a1": vec3,  # half its axis, 0 of a sphere
-            "x2": vec3,
-            "a2": vec3,  # 0 of a box, too
-            "s1": T,
-            "s2": T,
-            "d": vec3,  # from the first point to the second
-            "side": T,  # -1 if the first is inside a box, else 1
-        }
-        structs["Box"] = {
-            "x": vec3,  # centre
-            "R": mat3,  # axes
-            "h": vec3,  # half lengths
-        }
         work = {
             "twist": vec6,  # of the link, by the forces of rows between bodies; in the inward sweep the bias force
             "rate": T,  # of its joint

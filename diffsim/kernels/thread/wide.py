@@ -24,6 +24,13 @@ PREAMBLE = """
 namespace wp {
 typedef float wide __attribute__((ext_vector_type(BLOCK)));
 typedef int wide_int __attribute__((ext_vector_type(BLOCK)));
+inline wide_int numbers()
+{
+    wide_int n;
+    for (int k = 0; k < BLOCK; ++k)
+        n[k] = k;
+    return n;
+}
 inline wide mul(wide a, wide b) { return a * b; }
 inline wide add(wide a, wide b) { return a + b; }
 inline wide sub(wide a, wide b) { return a - b; }
@@ -130,7 +137,7 @@ def blocks(spec: KernelSpec) -> SimpleNamespace:
         """Return the number of the block's environment k."""
         ...
 
-    @wp.func_native("x[k] = value; return x;" if wide else "return value;")
+    @wp.func_native("return wp::numbers() == k ? wp::wide(value) : x;" if wide else "return value;")
     def with_element(x: T, k: int, value: U) -> T: ...
 
     @wp.func
