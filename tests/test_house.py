@@ -34,7 +34,6 @@ ROOMS = {  # as they are drawn
 }
 FLOORS = "thread", "laws", "tree", "mujoco", "pairs", "kernels"  # the last one has the files beside the rooms
 LONGEST = 200  # lines of a factory of kernels
-LONG = pytest.mark.xfail(reason="contacts of boxes and of capsules have longer ones")
 
 
 def lines(pattern: str) -> int:
@@ -71,7 +70,7 @@ def test_rooms_of_kernels_import_from_the_same_floor_and_below() -> None:
                 assert FLOORS.index(other) <= FLOORS.index(room), f"{path.relative_to(ROOT)} imports {module}"
 
 
-@pytest.mark.parametrize("room", [room if room != "pairs" else pytest.param(room, marks=LONG) for room in FLOORS])
+@pytest.mark.parametrize("room", FLOORS)
 def test_factories_of_kernels_are_short(room: str) -> None:
     for path in KERNELS.rglob("*.py"):
         for node in ast.parse(path.read_text()).body if path.parent.name == room else ():
