@@ -30,12 +30,10 @@ READ: dict[str, Callable[[Sequence[float]], float]] = {
     "middle": median,
     "most": max,
     "sum": sum,
-    "count": len,
 }
 SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "mean": lambda values: f"{mean(values):.0f}",
     "thousandths": lambda values: f"{1e3 * mean(values):.0f}",
-    "tenth": lambda values: f"{mean(values):.1f}",
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",
     "percent": lambda values: f"{mean(values):.1%}",

@@ -53,6 +53,14 @@ class DiffEnv(VectorEnv):
     reset. Up to `horizon` differentiable steps make a rollout, which `detach` ends; under torch.no_grad there is no
     limit.
 
+    Example:
+        env = diffsim.make("cartpole", num_envs=16, horizon=8)
+        obs, info = env.reset(seed=1)                                     # (16, 5)
+        action = torch.zeros(16, 1, requires_grad=True)
+        obs, reward, terminated, truncated, info = env.step(action)
+        reward.sum().backward()
+        obs = env.detach()                                                # the next rollout
+
     Args:
         task: task on the simulator's device and dtype; several environments may share it.
         scene: its robot. On a terrain the task measures heights (of start, observation, reward and end) from the ground

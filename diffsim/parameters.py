@@ -247,15 +247,30 @@ class _Robot:
 class ParametricSimulator(Simulator):
     """A Simulator whose steps are differentiable in the robot's constants, which are the same in all environments.
 
+    `parameters` is the dictionary to fit: it starts with the file's values, in float64 on the CPU. Assign tensors that
+    require gradients, take steps and call backward. `adjustable(name)` and `elements(name)` say which of its rows may
+    change and whose they are.
+
+    Example:
+        from diffsim.parameters import ParametricSimulator
+        scene = diffsim.load_scene("robot.xml")
+        sim = ParametricSimulator(scene, 4, diffsim.Integration("mujoco", 8), horizon=1, dtype=torch.float64)
+        mass = sim.parameters["mass"].requires_grad_()                     # (nbody,) kg
+        sim.parameters = {"mass": mass}
+        qpos, qvel = torch.tensor(scene.qpos0).repeat(4, 1), torch.zeros(4, scene.nv).double()
+        sim.step(qpos, qvel, torch.zeros(4, scene.nu).double())[1].sum().backward()
+        print(mass.grad)
+
     Args:
         scene: without fluid, gravity compensation, tendons and actuators at sites.
-        num_envs: as for Simulator, like the rest.
+        num_envs: number of copies N of the robot.
         integration: contact model and substeps.
-        *args: control_dt and horizon.
+        *args: control_dt [s] and horizon of Simulator.
         **options: those of Simulator without factors, forces and division.
 
     Raises:
-        SceneError: the robot has one of these.
+        SceneError: the robot has fluid, gravity compensation, tendons or actuators at sites.
+        ValueError: another argument out of range, with what is allowed.
     """
 
     def __init__(

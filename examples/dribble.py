@@ -15,8 +15,9 @@ from torch import Tensor
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
 from diffsim.tasks.base import Defaults
-from diffsim_robots.common import score
-from diffsim_robots.joystick import BEGIN, Go2
+from diffsim_robots.common import add_up, score
+from diffsim_robots.joystick import ORDER
+from diffsim_robots.unitree import BEGIN, Go2
 
 RADIUS, MASS, DRAG = 0.11, 0.43, 0.002  # m, kg, N s/m and N m s: a football of size 5 that comes to rest
 STIFFNESS, RANGE = 40.0, {"hip": (-0.4, 0.4), "thigh": (0.2, 1.6), "calf": (-2.5, -1.1)}  # N m/rad, rad: as of "go2"
@@ -36,7 +37,9 @@ class Dribble(Go2):
     initial_gain = 1.0
     defaults: ClassVar[Defaults] = {"rpo": BEGIN | {"horizon": 16, "num_envs": 128, "iterations": 1600}}
     num_random = Go2.num_random + 13
-    actor_dim, obs_dim, obs_parts = BALL + (Go2.actor_dim or 0), BALL + Go2.obs_dim, ()
+    actor_dim, obs_dim = BALL + (Go2.actor_dim or 0), BALL + Go2.obs_dim
+    obs_parts = (("ball", 2), ("ball_velocity", 2), ("place", 2), ("place_velocity", 2), *Go2.obs_parts)
+    weights = Go2.weights | {"ball_velocity": -0.5}
 
     @classmethod
     def load_robot(cls) -> Scene:
@@ -111,12 +114,13 @@ class Dribble(Go2):
         return torch.stack((c * vectors[..., 0] + s * vectors[..., 1], c * vectors[..., 1] - s * vectors[..., 0]), -1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Go2's, and the ball's velocity towards the place."""
-        _, rolls, _, speed = obs[..., :BALL].split(2, dim=-1)
-        return super().reward(obs[..., BALL:], action) - 0.5 * score((rolls - speed).square().sum(-1), 0.1)
+        return add_up(self.reward_terms(obs, action), (*ORDER, ("ball_velocity",)))
 
-    def terminated(self, obs: Tensor) -> Tensor:
-        return super().terminated(obs[..., BALL:])
+    def reward_terms(self, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
+        """Go2's, and the ball's velocity towards the place."""
+        part = self.named(obs)
+        off = score((part["ball_velocity"] - part["place_velocity"]).square().sum(-1), 0.1)
+        return super().reward_terms(obs, action) | {"ball_velocity": self.weights["ball_velocity"] * off}
 
     def achieved(self, qpos: Tensor, memory: Tensor) -> Tensor:
         """Tell which balls (...) are at their place."""

@@ -14,7 +14,7 @@ from diffsim.robot.mjcf import load_scene
 from diffsim.robot.pairs import with_pairs
 from diffsim.robot.scene import Scene
 from diffsim.tasks.base import ASSETS, Defaults
-from diffsim_robots.joystick import BEGIN, G1, humanoid
+from diffsim_robots.unitree import BEGIN, G1
 
 LEG = "hip_roll", "hip_yaw", "knee", "ankle_roll"  # links whose first geoms touch those of the other leg
 
@@ -22,7 +22,7 @@ LEG = "hip_roll", "hip_yaw", "knee", "ankle_roll"  # links whose first geoms tou
 class Ghost(G1):
     """A G1 whose legs pass through each other, as the shipped one's, without a reward for feet that stay apart."""
 
-    name, robot, initial_gain = "ghost", humanoid()._replace(apart=0.0), 1.0
+    name, robot, initial_gain = "ghost", G1.robot._replace(apart=0.0), 1.0
     defaults: ClassVar[Defaults] = {
         "rpo": BEGIN | {"horizon": 16, "initial_log_std": -3.0, "num_envs": 1024, "iterations": 600}
     }

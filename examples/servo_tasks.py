@@ -16,7 +16,7 @@ from torch import Tensor
 from diffsim.tasks import Contact
 from diffsim.tasks.base import ASSETS
 from diffsim_robots.imitation.task import HumanoidImitation
-from diffsim_robots.joystick import Go2
+from diffsim_robots.unitree import Go2
 
 STIFFNESS = 2.0  # 1/rad: a servo gives its motor's largest torque half a radian from the target
 

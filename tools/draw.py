@@ -21,7 +21,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -63,6 +63,7 @@ FLOOR, AROUND = 4.0, 4.8  # m after which the floor repeats; s that a robot with
 DANCE = 12.6, 5.0  # s of the clip that a film of tracking begins with, and how many it shows
 LEAST_FPS, QUALITY = 25.0, 40  # of a film; WebP's, of 100
 SPACING = 1.5  # m between the robots of a batch
+NEAR = 0.9  # m, between the roots of two robots of a batch, at least
 # Seconds from which a film of commands has each one, as shares of the robot's largest, and what it is called
 COMMANDS = (
     (0.0, (0.0, 0.0, 0.0), "stand"),
@@ -266,7 +267,7 @@ def gait(
 
 
 def batch(
-    checkpoint: Positional[Path], count: int = 36, seconds: float = 4.0, size: tuple[int, int] = (640, 360)
+    checkpoint: Positional[Path], count: int = 9, seconds: float = 3.0, size: tuple[int, int] = (640, 360)
 ) -> None:
     """A film of many environments of one batch, each at its place of a grid, called <task>_batch.webp.
 
@@ -283,14 +284,15 @@ def batch(
     rows = np.stack(
         [episodes.episode(k)[0][round(1 / dt) :: every][: round(seconds / dt / every)] for k in range(count)]
     )
+    spacing = SPACING
+    while nearest(placed := apart(rows, side, spacing)) < NEAR:  # worlds are independent
+        spacing += 0.25
+    rows = placed
     model, _ = drawable(episodes.scene)
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     model.vis.map.shadowclip *= side  # the light sees all of them
     data, option, pert, camera = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.95 * side * SPACING
-    spread = SPACING * (np.arange(side) - (side - 1) / 2)
-    places = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2)
-    rows[:, :, :2] += places[:, None] - rows[:, :1, :2]  # each starts at its place
+    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.8 * side * spacing
     frames = []
     with mujoco.Renderer(model, size[1], size[0], max_geom=model.ngeom * count + 100) as renderer:
         for moment in rows.swapaxes(0, 1):
@@ -305,6 +307,22 @@ def batch(
             frames.append(renderer.render())
     path = save_webp(FIGURES / f"{saved.args['env'].partition(':')[0]}_batch.webp", frames, 1 / (every * dt))
     print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
+
+
+def apart(rows: NDArray[Any], side: int, spacing: float) -> NDArray[Any]:
+    """Episodes qpos (n, T, nq), moved so that each starts at its place of a grid."""
+    spread = spacing * (np.arange(side) - (side - 1) / 2)
+    places = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2)
+    moved = rows.copy()
+    moved[:, :, :2] += places[:, None] - rows[:, :1, :2]
+    return moved
+
+
+def nearest(rows: NDArray[Any]) -> float:
+    """The least distance [m] between the roots of two robots at the same time."""
+    x = rows[:, :, :2].swapaxes(0, 1)
+    gaps = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
+    return float((gaps + 1e9 * np.eye(len(rows))).min())
 
 
 def commands(checkpoint: Positional[Path], size: tuple[int, int] = (480, 320)) -> None:

@@ -61,7 +61,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     VADR, NBALL, SLOTS, BLOCKS = spec.dof0 - 1, spec.nball, spec.room, spec.pair_sizes.blocks
     # Local arrays have at least one element, also where they are not read.
     TENSIONS, BODIES = spec.nu if MUSCLE or TENDON or SITE else 1, max(spec.forced, 1)
-    CONSTANTS = max(spec.nconstants, 1)
+    PARAMETERS = max(spec.parameters, 1)
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def backward(
@@ -82,14 +82,14 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         # out
         nonfinite_gradients: wp.array(dtype=int),
     ):
-        """Turn the gradient by the new state into those by the old one, controls, constants and forces."""
+        """Turn the gradient by the new state into those by the old one, controls, parameters and forces."""
         here = lane(m, first, wp.tid(), T(seconds), batch.factors)
         links = wp.zeros(shape=SLOTS, dtype=Link)
         nodes = wp.zeros(shape=SLOTS, dtype=Node)
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)
         if wp.static(PAIRS):
             contacts = wp.zeros(shape=BLOCKS, dtype=Contact)
-        adj_factors = wp.zeros(shape=CONSTANTS, dtype=T)
+        adj_parameters = wp.zeros(shape=PARAMETERS, dtype=T)
         adj_forces = wp.zeros(shape=BODIES, dtype=vec6)
         tension = wp.zeros(shape=TENSIONS, dtype=T)
         adj_tension = wp.zeros(shape=TENSIONS, dtype=T)
@@ -128,11 +128,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(PAIRS):
                 pairs.correct_lambda(m, here, links, ck, contacts, nodes)
             # differentiate
-            phi.differentiate(m, here, links, nodes, carrier, ck, adj, adj_factors)
+            phi.differentiate(m, here, links, nodes, carrier, ck, adj, adj_parameters)
             if wp.static(LEARNED):
-                parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_factors)
+                parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_parameters)
             if wp.static(PAIRS):
-                pairs.add_adjoint(m, here, links, contacts, nodes, adj, adj_factors)
+                pairs.add_adjoint(m, here, links, contacts, nodes, adj, adj_parameters)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):
@@ -142,19 +142,19 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(SITE):
                 transmission.add_sites_adjoint(m, here, batch.ctrl, links, nodes, adj, adj_tension)
             # project
-            phi.project(m, here, ck, links, nodes, adj, adj_factors)
+            phi.project(m, here, ck, links, nodes, adj)
             if wp.static(NBALL > 0 and STIFFNESS):
                 phi.correct_ball_springs(m, here, links, nodes)
             if wp.static(FLOATING):
                 base = phi.project_base(m, links[0], nodes[0], adj[0], base)
 
         # A gradient that is not finite, or of an environment that kept its state, is zero.
-        failed = gradient.count_nonfinite(m, here, base, nodes, adj_tension, adj_factors, adj_forces)
+        failed = gradient.count_nonfinite(m, here, base, nodes, adj_tension, adj_parameters, adj_forces)
         contained = block.read_flags(nonfinite, here.e)
         if here.lane == 0:
             block.count(nonfinite_gradients, here.e, pick(T(0.0), contained, T(0.0), failed))
         drop = failed + contained
-        gradient.write_controls(m, here, drop, batch.ctrl, nodes, adj_tension, adj_factors, g)
+        gradient.write_controls(m, here, drop, nodes, adj_tension, adj_parameters, g)
         if wp.static(FORCED):
             force.write_forces_adjoint(m, here, drop, adj_forces, g.forces)
         gradient.write_state(m, here, drop, batch.qpos, base, nodes, g)

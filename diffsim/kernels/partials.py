@@ -9,7 +9,6 @@ from diffsim.kernels.laws.joint import joint_law
 from diffsim.kernels.mujoco.ground import ground_adjoint
 from diffsim.kernels.mujoco.limits import joint_limits
 from diffsim.kernels.thread.exchange import lane_sums
-from diffsim.kernels.thread.lane import D_LIMIT, K_LIMIT
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -21,12 +20,12 @@ from diffsim.kernels.tree.link import link_law
 def partial_derivatives(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of the stages `differentiate` and `project`."""
     t, sp, kin, sums = types(spec), spatial(spec), kinematics(spec), lane_sums(spec)
-    T, vec2, vec3, Model, Lane, Ck = t.T, t.vec2, t.vec3, t.Model, t.Lane, t.Checkpoint
+    T, vec3, Model, Lane, Ck = t.T, t.vec3, t.Model, t.Lane, t.Checkpoint
     Link, Node, Adjoint, Base, Links, Nodes = t.Link, t.Node, t.Adjoint, t.Base, t.Links, t.Nodes
     Adjoints, Array, join, load, link_of = t.Adjoints, t.Ts, sp.join, kin.load, kin.link_of
     link, joint, ground, limits = link_law(spec), joint_law(spec), ground_adjoint(spec), joint_limits(spec)
     CONTACT, CLAMP, LIMIT, BASE_DAMPED = spec.has("contact clamp limit base_damping")
-    CONSTRAINED, DAMPED, IMPLICIT, VARIED = spec.constrained, spec.damped, spec.implicit, spec.varied
+    CONSTRAINED, DAMPED, IMPLICIT = spec.constrained, spec.damped, spec.implicit
     LIMIT = LIMIT and not CONSTRAINED  # the penalty law
     FLOATING, VADR, NV, NBALL = spec.floating, spec.dof0 - 1, spec.nv, spec.nball
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
@@ -44,7 +43,7 @@ def partial_derivatives(spec: KernelSpec) -> SimpleNamespace:
         ck: Ck,
         # out
         adj: Adjoints,
-        adj_factors: Array,
+        adj_parameters: Array,
     ):
         """Compute the partial derivatives of phi of each link into adj."""
         for i in range(1, INERT + 1):
@@ -52,15 +51,17 @@ def partial_derivatives(spec: KernelSpec) -> SimpleNamespace:
         s = int(0)  # the contact in the checkpoint
         for i in range(FIRST, here.n):
             k = here.at + i
-            own = link.link_adjoint(m, here, k, links[i], nodes[i], carrier, adj_factors)
+            own = link.link_adjoint(m, here, k, links[i], nodes[i], carrier)
             if wp.static(CONSTRAINED and CONTACT):
-                own, s = ground.add_contacts_adjoint(m, here, k, s, links[i], nodes[i], carrier, ck, own, adj_factors)
+                own, s = ground.add_contacts_adjoint(
+                    m, here, k, s, links[i], nodes[i], carrier, ck, own, adj_parameters
+                )
             if wp.static(DAMPED):
-                own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own, adj_factors)
+                own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own)
             adj[i] = own
 
     @wp.func
-    def joint_derivatives(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
+    def joint_derivatives(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node):
         """Differentiate the joint's force with respect to q and qd, and to that of its motors."""
         k = here.at + i
         end_qd = link.qd
@@ -70,19 +71,12 @@ def partial_derivatives(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(CLAMP):
             unclamped = own.unclamped
         derivatives = joint.derivatives(m, here, k, link.q, link.qd, end_qd, unclamped)
-        if wp.static(VARIED and LIMIT):
-            by = joint.limit_constants_derivatives(m, here, k, link.q, link.qd, end_qd)
-            adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * by[0]  # of one lane with the joint
-            adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - T(m.owned[k]) * own.lam * by[1]
         if wp.static(CONSTRAINED):
-            con_derivatives = limits.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
-            derivatives = derivatives + vec2(con_derivatives[0], con_derivatives[1])
-            if wp.static(VARIED):
-                adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - T(m.owned[k]) * own.lam * con_derivatives[2]
+            derivatives = derivatives + limits.joint_derivatives(m, here, k, link.q, link.qd, own.qacc)
         return derivatives, unclamped
 
     @wp.func
-    def project(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints, adj_factors: Array):
+    def project(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints):
         """Sum adj over subtrees, and project it on the joints into nodes' gq, gqd and gtau."""
         slots = int(SLOTS)
         if wp.static(SHARERS > 1):
@@ -100,7 +94,7 @@ def partial_derivatives(spec: KernelSpec) -> SimpleNamespace:
                     p = m.inboard[k]
                     turned = m.outboard[k]
                 own = nodes[i]
-                derivatives, unclamped = joint_derivatives(m, here, i, ck, links[i], own, adj_factors)
+                derivatives, unclamped = joint_derivatives(m, here, i, ck, links[i], own)
                 S = links[i].S
                 total = adj[i]
                 xv = total.v - wp.spatial_cross_dual(links[p].V, total.a)

@@ -7,7 +7,6 @@ import warp as wp
 
 from diffsim.kernels.laws.force import external_force
 from diffsim.kernels.thread.exchange import lane_sums
-from diffsim.kernels.thread.lane import MOTOR
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import MAX_POSITION, MAX_SPEED, KernelSpec
@@ -159,7 +158,7 @@ def gradient_access(spec: KernelSpec) -> SimpleNamespace:
     DRIVEN, MUSCLE, TENDON, SITE = spec.has("motor muscle tendon site")
     PULLED, transmission = MUSCLE or TENDON or SITE, transmission_law(spec) if TENDON or SITE else None
     NU, VADR, NBALL, FLOATING, FORCED = spec.nu, spec.dof0 - 1, spec.nball, spec.floating, spec.forced > 0
-    VARIED, NCONSTANTS, THREADS_PER_ENV = spec.varied, spec.nconstants, spec.threads_per_env
+    VARIED, NPARAMETERS, THREADS_PER_ENV = spec.varied, spec.parameters, spec.threads_per_env
 
     @wp.func
     def read_end_gradient(m: Model, here: Lane, ck: Ck, g: t.Batch, nodes: Nodes):
@@ -189,7 +188,7 @@ def gradient_access(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def count_nonfinite(
-        m: Model, here: Lane, base: Base, nodes: Nodes, adj_tension: Array, adj_factors: Array, adj_forces: t.vec6s
+        m: Model, here: Lane, base: Base, nodes: Nodes, adj_tension: Array, adj_parameters: Array, adj_forces: t.vec6s
     ):
         """Count numbers of the gradient that are not finite."""
         failed = T(0.0)
@@ -205,9 +204,9 @@ def gradient_access(spec: KernelSpec) -> SimpleNamespace:
                 failed = failed + block.is_nonfinite(adj_tension[m.muscle[entry]])
         if wp.static(TENDON or SITE):
             failed = failed + transmission.count_nonfinite(adj_tension)
-        if wp.static(NCONSTANTS > 0):
-            for k in range(NCONSTANTS):
-                failed = failed + block.is_nonfinite(adj_factors[k])
+        if wp.static(NPARAMETERS > 0):
+            for k in range(NPARAMETERS):
+                failed = failed + block.is_nonfinite(adj_parameters[k])
         if wp.static(FORCED):
             failed = failed + force.count_nonfinite_forces(m, here, adj_forces)
         if wp.static(THREADS_PER_ENV > 1):
@@ -226,14 +225,13 @@ def gradient_access(spec: KernelSpec) -> SimpleNamespace:
         here: Lane,
         # controls and gradients in
         drop: T,
-        ctrl: t.array2,
         nodes: Nodes,
         adj_tension: Array,
-        adj_factors: Array,
+        adj_parameters: Array,
         # out
         g: t.Batch,
     ):
-        """Write the gradients of controls and factors."""
+        """Write the gradients of controls and parameters."""
         for k in range(NU):
             if m.motor_lane[k] == here.lane:
                 g_force = T(0.0)
@@ -242,13 +240,11 @@ def gradient_access(spec: KernelSpec) -> SimpleNamespace:
                 if wp.static(PULLED):
                     g_force = g_force + adj_tension[k]
                 if wp.static(VARIED):
-                    motor = T(m.gear[k]) * read(ctrl, here.e, k) + T(m.motor_bias[k])
-                    adj_factors[MOTOR] = adj_factors[MOTOR] + g_force * motor
                     g_force = here.motor * g_force
                 write_gradient(g.ctrl, here.e, k, drop, g_force * T(m.gear[k]))
-        if wp.static(NCONSTANTS > 0):
-            for k in range(NCONSTANTS):
-                total = adj_factors[k]
+        if wp.static(NPARAMETERS > 0):
+            for k in range(NPARAMETERS):
+                total = adj_parameters[k]
                 if wp.static(THREADS_PER_ENV > 1):
                     total = sums.add(total)
                 if here.lane == 0:

@@ -27,6 +27,18 @@ DOFS = {int(Joint.mjJNT_FREE): 6, int(Joint.mjJNT_BALL): 3}  # of joints with se
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
     """Read an MJCF file or copy a model.
 
+    Example:
+        scene = diffsim.load_scene("robot.xml")
+        print(scene.nq, scene.nv, scene.nu, scene.qpos0)
+
+    Args:
+        path: file, or a model or specification of MuJoCo, which stays as it is.
+
+    Returns:
+        The robot for Simulator, with MuJoCo's sizes nq, nv and nu, the pose qpos0 (nq,) at rest, the ground_height [m],
+        a copy of the model as mj_model and, in left_out, what of the file is not simulated. `with_terrain(vertices)`
+        and `with_penalty(constants)` return copies on other ground or with other constants of the penalty law.
+
     Raises:
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
     """

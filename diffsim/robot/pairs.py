@@ -229,6 +229,10 @@ def obstacle_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
 def with_pairs(scene: Scene) -> Scene:
     """Return a copy whose parts touch each other and fixed geoms as the file lets them, on MuJoCo's contact.
 
+    Example:
+        from diffsim.robot.pairs import with_pairs
+        scene = with_pairs(diffsim.load_scene("robot.xml"))  # for Simulator, or to return from Task.load_robot
+
     Capsules and boxes stand for other shapes, see `as_primitives`. A pair is left out that so overlaps in the first
     keyframe, or the reference pose, though the file's shapes do not.
 

@@ -31,6 +31,16 @@ State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 class Simulator:
     """A batch of independent copies of one scene, stepped by control steps of equal length.
 
+    Example:
+        scene = diffsim.load_scene("robot.xml")
+        sim = diffsim.Simulator(scene, 16, diffsim.Integration("mujoco", 8), control_dt=0.02, horizon=2)
+        qpos, qvel = torch.tensor(scene.qpos0).float().repeat(16, 1), torch.zeros(16, scene.nv)
+        ctrl = torch.zeros(16, scene.nu, requires_grad=True)              # in [-1, 1]
+        for _ in range(2):
+            qpos, qvel = sim.step(qpos, qvel, ctrl)
+        qvel.sum().backward()
+        sim.rewind()                                                      # the next rollout
+
     Up to `horizon` differentiable control steps make a rollout, and `rewind` begins the next one. A backward pass must
     run before the next rollout overwrites its steps, otherwise it raises RuntimeError.
 
@@ -48,11 +58,12 @@ class Simulator:
     Attributes:
         factors: (N, 8) multipliers of the scene's constants, initially ones. Columns as in scene.FACTORS: constants of
             contact and of limits; mass and inertia of all links, without armature; force of motors and muscles. Change
-            it in place or assign another tensor. A step uses the values at its call and is differentiable in them.
-            (N, 0) without factors=True.
+            it in place or assign another tensor. A step uses the values at its call. A factor has no gradient: use
+            ParametricSimulator.parameters. (N, 0) without factors=True.
         forces: (N, nbody, 6) external force [N] and torque [N m] on each body in world axes at its centre of mass,
             initially zero, constant over a control step: MuJoCo's xfrc_applied, with rows as in scene.mj_model. Used
-            like factors. Forces on the world and on bodies fixed to it have no effect. (N, 0, 6) without forces=True.
+            like factors, but a step is differentiable in them. Forces on the world and on bodies fixed to it have no
+            effect. (N, 0, 6) without forces=True.
         nonfinite: (N,) bool, environments whose last step failed, see docs/physics.md. They keep the state from before
             it, with zero gradient. Other environments do not change.
         residual: (N,) largest residual of Newton's method in the last step, see docs/physics.md. Zeros on soft contact.
@@ -126,6 +137,7 @@ class Simulator:
 
     @factors.setter
     def factors(self, value: torch.Tensor) -> None:
+        self._refuse_gradient(value)
         self._factors = self._check_given("factors", value, *self._factors.shape[1:])
 
     @property
@@ -160,7 +172,7 @@ class Simulator:
         return scene
 
     def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        """Advance all environments by one control step, differentiable in its arguments, `factors` and `forces`.
+        """Advance all environments by one control step, differentiable in its arguments and `forces`.
 
         Args:
             qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, which need not have unit length.
@@ -172,8 +184,8 @@ class Simulator:
             qpos, qvel after the step, of the same shapes.
 
         Raises:
-            ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors or forces that were changed
-                in place to what is not allowed.
+            ValueError: an argument of the wrong shape, dtype or device; factors that require grad; on the CPU, factors
+                or forces that were changed in place to what is not allowed.
             RuntimeError: a differentiable step in a full rollout.
         """
         for name, value, width in zip(("qpos", "qvel", "ctrl"), (qpos, qvel, ctrl), self._widths, strict=False):
@@ -182,6 +194,7 @@ class Simulator:
 
     def advance(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
         """Do what `step` does, without checks of shape, dtype and device."""
+        self._refuse_gradient(self._factors)
         if self.device.type == "cpu":  # on a GPU the check would wait for the device
             for name, given in (("factors", self._factors), ("forces", self._forces)):
                 if given.shape[1]:
@@ -266,6 +279,11 @@ class Simulator:
         if found != (wanted := ((self.num_envs, *size), self.dtype, self.device)):
             have, must = (" ".join(map(str, each)) for each in (found, wanted))
             raise ValueError(f"{name} is {have}, must be a torch.Tensor of {must}")
+
+    def _refuse_gradient(self, factors: torch.Tensor) -> None:
+        """Raise ValueError if factors require grad; a scene's parameters, which are in their place, may."""
+        if isinstance(factors, torch.Tensor) and factors.requires_grad and not self.scene.parameters:
+            raise ValueError("factors require grad, but a factor has no gradient: use ParametricSimulator.parameters")
 
     def _check_given(self, name: str, value: torch.Tensor, *size: int) -> torch.Tensor:
         """Raise ValueError unless factors or forces are finite, and factors not negative, divisors positive."""

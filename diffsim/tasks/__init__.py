@@ -21,9 +21,9 @@ REGISTERED = {
     "swimmer": "diffsim_robots.swimmer:Swimmer",
     "walker": "diffsim_robots.walker:Walker",
     "humanoid_imitation": "diffsim_robots.imitation.task:HumanoidImitation",
-    "go1": "diffsim_robots.joystick:Go1",
-    "go2": "diffsim_robots.joystick:Go2",
-    "g1": "diffsim_robots.joystick:G1",
+    "go1": "diffsim_robots.unitree:Go1",
+    "go2": "diffsim_robots.unitree:Go2",
+    "g1": "diffsim_robots.unitree:G1",
     "g1_track": "diffsim_robots.imitation.tracking:G1Track",
 }
 

@@ -140,7 +140,24 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
 
 
 def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
-    """The policy of any script's checkpoint, on the CPU in float32; raises ValueError as `load` does."""
+    """Read the policy of any script's checkpoint, without noise, on the CPU in float32; no code of the file runs.
+
+    Example:
+        from diffsim.training import load_policy
+        from diffsim.training.checkpoint import POLICIES
+        policy = load_policy(POLICIES / "ant.pt").network       # or runs/<run>/checkpoint.pt
+        action = policy(torch.zeros(64, 37))                    # (64, 8) in [-1, 1]
+
+    Args:
+        path: checkpoint, or what `diffsim export` wrote.
+
+    Returns:
+        `network`, an nn.Module from observations (..., obs_dim) of the actor to actions (..., nu), and the `args`,
+        `script` and `iteration` of its training.
+
+    Raises:
+        ValueError: the file is missing, broken or no checkpoint.
+    """
     state = load(path)
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated

@@ -48,6 +48,7 @@ class Evaluation:
     control_dt: float  # s
     others: dict[str, float] = field(default_factory=dict)  # what else a script measured, by name
     ghost: Tensor | None = None  # (T, n, nq) what was to be tracked, before each step; see Task.ghost
+    terms: dict[str, float] = field(default_factory=dict)  # of the mean return, by name; see Task.reward_terms
 
     @property
     def length(self) -> float:
@@ -56,6 +57,7 @@ class Evaluation:
     def scalars(self) -> dict[str, float]:
         values = {"eval/return": self.returns.median().item(), "eval/length": self.length}
         values |= {} if self.speed is None else {"eval/speed": self.speed}
+        values |= {f"eval/reward_{name}": value for name, value in self.terms.items()}
         return values | {f"eval/{name}": value for name, value in self.others.items()}
 
     def __str__(self) -> str:
@@ -96,6 +98,8 @@ class Player:
         self.obs = torch.zeros(env.num_envs, env.task.obs_dim, dtype=env.dtype, device=env.device)
         self.returns, self.lengths = torch.zeros_like(self.obs[:, 0]), torch.zeros_like(env.episode_step)
         self.alive = torch.ones_like(self.lengths, dtype=torch.bool)
+        terms = env.task.reward_terms(self.obs, self.obs.new_zeros(env.num_envs, env.scene.nu))
+        self.terms = {name: torch.zeros_like(self.returns) for name in terms}  # of the returns
         self.step = graph.capture(self._step, env.device, env) if self.captured else self._step
         self.patience = LOOK_EVERY if env.device.type == "cuda" else 1
 
@@ -108,8 +112,10 @@ class Player:
 
     def _step(self) -> Tensor:
         action = self.policy(self.obs)
-        obs, reward, terminated, truncated, _ = self.env.step(action)
+        obs, reward, terminated, truncated, info = self.env.step(action)
         self.obs.copy_(obs)
+        for name, term in self.env.task.reward_terms(info["final_obs"], action.clamp(-1.0, 1.0)).items():
+            self.terms[name] += torch.where(self.alive & ~info["nonfinite"], term, torch.zeros_like(term))
         self.returns += torch.where(self.alive, reward, torch.zeros_like(reward))
         self.lengths += self.alive
         self.alive &= ~(terminated | truncated)
@@ -123,6 +129,8 @@ class Player:
         self.obs.copy_(env.reset(seed=seed)[0])
         self.returns.zero_()
         self.lengths.zero_()
+        for total in self.terms.values():
+            total.zero_()
         self.alive.fill_(True)
         while len(path) % self.patience or self.alive.any():
             path.append(env.qpos.clone())
@@ -138,7 +146,8 @@ class Player:
         missed = env.sim.unconverged.sum().item()
         others = {"unconverged": missed} if missed else {}  # control steps, of Newton's method
         followed = torch.stack(ghosts[: len(qpos)]) if ghosts else None
-        return Evaluation(returns, lengths, speed, qpos, action, env.scene, env.control_dt, others, followed)
+        terms = {name: total.mean().item() for name, total in self.terms.items()}
+        return Evaluation(returns, lengths, speed, qpos, action, env.scene, env.control_dt, others, followed, terms)
 
 
 def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED) -> Evaluation:

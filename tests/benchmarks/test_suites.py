@@ -10,7 +10,6 @@ import pfpn_sac
 import pytest
 import sac_baseline
 import sapo
-import stages
 import suites
 from common import RESULTS, ROOT
 from gps_variants import VariantArgs
@@ -24,7 +23,6 @@ from diffsim.training import parse
 
 SCRIPTS = {
     "benchmarks/gps_variants": VariantArgs,
-    "benchmarks/stages": stages.Args,
     "mbpo": mbpo.Args,
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,

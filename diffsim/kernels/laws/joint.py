@@ -139,12 +139,4 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
             kq = kq + limit_active(k, d, violation, qd) * d * return_velocity(violation, end_qd)
         return vec2(kq, -resisted[1])
 
-    @wp.func
-    def limit_constants_derivatives(m: Model, here: Lane, i: int, q: T, qd: T, end_qd: T):
-        """Return d force / d factor of (k_limit, d_limit); arguments as in derivatives."""
-        violation = limit_violation(m, i, q)
-        k, d = limit_constants(m, here, i)
-        active = limit_active(k, d, violation, qd)
-        return active * vec2(T(m.k_limit[i]) * violation, -T(m.d_limit[i]) * wp.abs(violation) * end_qd)
-
     return functions(locals())

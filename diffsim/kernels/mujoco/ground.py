@@ -14,7 +14,6 @@ from diffsim.kernels.laws.terrain import terrain_contact
 from diffsim.kernels.mujoco.cone import friction_cone
 from diffsim.kernels.mujoco.impedance import impedance_law
 from diffsim.kernels.thread.columns import CONTACT
-from diffsim.kernels.thread.lane import K_D, K_N, MU
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -217,7 +216,7 @@ def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, Model, Lane, Link, CarrierPos = t.T, t.vec3, t.Model, t.Lane, t.Link, t.CarrierPos
     force_at, point_velocity = sp.force_at, sp.point_velocity
     in_frame, in_world, cone = terrain_contact(spec).in_frame, terrain_contact(spec).in_world, friction_cone(spec)
-    (TERRAIN, PYRAMID), FRAMED, VARIED = spec.has("terrain pyramid"), spec.framed, spec.varied
+    (TERRAIN, PYRAMID), FRAMED = spec.has("terrain pyramid"), spec.framed
     NV, ROOM = spec.nv, contact_room(spec)
     LEARNED, COLUMNS = spec.parameters > 0, spec.columns.ground
 
@@ -243,7 +242,7 @@ def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
         ck: t.Checkpoint,
         # adjoints in and out
         adj: t.Adjoint,
-        adj_factors: t.Ts,
+        adj_parameters: t.Ts,
     ):
         """Add the contacts' part of phi to link k's adjoints; returns them, and the next link's first contact."""
         c = recorded_sphere(here, s, ck)
@@ -259,19 +258,12 @@ def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
                 jar[r] = kin.load(ck.a, here.row, 2 * NV + 4 * (ROOM * here.lane + s) + 1 + r, here.e)
             f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
             w = in_frame(E, point_velocity(node.W, p))
-            velocity = in_frame(E, point_velocity(link.V, p))
             g_jar = H * w
             g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
-            if wp.static(VARIED):
-                by_k = T(0.5) * coef[1] * wp.dot(g_jar, velocity) + g_jar[2] * state[2]
-                by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
-                adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
-                adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
             if wp.static(LEARNED):
                 by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                adj_factors[COLUMNS + CONTACT * c] = adj_factors[COLUMNS + CONTACT * c] - by_mu
-                adj_factors[COLUMNS + CONTACT * c + 1] = adj_factors[COLUMNS + CONTACT * c + 1] + wp.dot(f, w)
+                adj_parameters[COLUMNS + CONTACT * c] = adj_parameters[COLUMNS + CONTACT * c] - by_mu
+                adj_parameters[COLUMNS + CONTACT * c + 1] = adj_parameters[COLUMNS + CONTACT * c + 1] + wp.dot(f, w)
             if wp.static(FRAMED):  # adjoint of a rotation of the frame
                 g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
             if wp.static(PYRAMID):

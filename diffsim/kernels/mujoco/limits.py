@@ -68,16 +68,14 @@ def joint_limits(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def joint_derivatives(m: Model, here: Lane, i: int, q: T, qd: T, qdd: T):
-        """Differentiate that force with respect to q, qd and the factor of k_limit."""
-        derivatives = vec3()
+        """Differentiate that force with respect to q and qd."""
+        derivatives = vec2()
         if wp.static(LIMIT):
             state, sign = limit_row(m, here, i, q)
             b = limit_damping(m, here, i)
             jar = sign * (qdd + b * qd) + state[2]
             D = pick(jar, T(0.0), state[0], T(0.0))
-            derivatives = -D * vec3(state[3] + jar * state[1], b, T(0.0))
-            if wp.static(VARIED):
-                derivatives[2] = -D * (T(0.5) * b * qd + sign * state[2]) / here.k_limit
+            derivatives = -D * vec2(state[3] + jar * state[1], b)
         if wp.static(LOSS):
             loss = m.joint_loss[i]
             f = T(loss[1]) * (qdd + T(loss[2]) * qd)

@@ -23,10 +23,9 @@ WHOLE, SIDE = 1, 2  # a way along an axis of the box is at most as long as the b
 
 
 @cache
-def capsule_contacts(U: type) -> SimpleNamespace:
-    """Make the functions for numbers of this type."""
-    t, spheres = geom_types(U), sphere_contacts(U)
-    vec3, Geom, Touches = t.vec3, t.Geom, t.Touches
+def box_features(U: type) -> SimpleNamespace:
+    """Make the function that finds what of a box is nearest to a capsule, and its result, for numbers of this type."""
+    vec3 = geom_types(U).vec3
     same_sq, skew_sq = (each[int(U == wp.float32)] for each in (SAME_SQ, SKEW_SQ))
     Feature = struct(
         "Feature",
@@ -38,8 +37,6 @@ def capsule_contacts(U: type) -> SimpleNamespace:
             "corner": vec3,  # whose signs are those of the nearest corner
         },
     )
-    # A point s on the capsule's axis, and how it moves
-    Place = struct("Place", {"s": U, "by_y": vec3, "by_h": vec3})
 
     @wp.func
     def nearest_feature(y: vec3, h: vec3, b: vec3):
@@ -112,6 +109,17 @@ def capsule_contacts(U: type) -> SimpleNamespace:
                         feature.corner = middle
                         feature.corner[j] = side
         return feature
+
+    return SimpleNamespace(Feature=Feature, nearest=nearest_feature)
+
+
+@cache
+def capsule_contacts(U: type) -> SimpleNamespace:
+    """Make the functions for numbers of this type."""
+    t, spheres, features = geom_types(U), sphere_contacts(U), box_features(U)
+    vec3, Geom, Touches, Feature, nearest_feature = t.vec3, t.Geom, t.Touches, features.Feature, features.nearest
+    # A point s on the capsule's axis, and how it moves
+    Place = struct("Place", {"s": U, "by_y": vec3, "by_h": vec3})
 
     @wp.func
     def first_place(feature: Feature, y: vec3, h: vec3):

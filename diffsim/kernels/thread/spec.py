@@ -6,7 +6,7 @@ from typing import Any
 from diffsim.kernels.thread.columns import Columns
 from diffsim.kernels.thread.division import Division
 from diffsim.robot.pairs import PairSizes
-from diffsim.robot.scene import FACTORS, Scene
+from diffsim.robot.scene import Scene
 
 FAR = 256.0  # m and rad, beyond which rounding a substep's motion to float32 matters
 MAX_POSITION = 1e5  # m and rad; beyond, float32 does not resolve a hundredth
@@ -91,11 +91,6 @@ class KernelSpec:
     def columns(self) -> Columns:
         """Return where the gradients by the scene's constants are, if it has parameters."""
         return Columns.of(self.nlink, self.nu, self.spheres, self.pairs)
-
-    @property
-    def nconstants(self) -> int:
-        """Return the number of constants with gradients: factors of each environment, or parameters of the scene."""
-        return self.parameters or (len(FACTORS) if self.varied else 0)
 
     @property
     def nfactor(self) -> int:
