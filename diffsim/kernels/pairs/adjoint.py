@@ -23,7 +23,7 @@ from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.tree.branches import branch_solver
 from diffsim.kernels.tree.kinematics import kinematics
-from diffsim.robot.pairs import GEOMS
+from diffsim.robot.types import GEOMS
 
 ACCURACY_ADJOINT = 1e-12, 1e-6  # as ACCURACY of pairs.py, in float64 and in float32
 

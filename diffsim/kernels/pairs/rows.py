@@ -26,7 +26,7 @@ from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
 from diffsim.kernels.tree.kinematics import kinematics
-from diffsim.robot.pairs import GEOMS, JOINT
+from diffsim.robot.types import GEOMS, JOINT
 
 ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterate's, in the norm of T^-1
 
