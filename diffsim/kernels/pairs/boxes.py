@@ -59,8 +59,7 @@ def box_contacts(U: type) -> SimpleNamespace:
         Q = wp.transpose(one.R) * other.R
         d = wp.transpose(one.R) * (other.x - one.x)
         d2 = wp.transpose(other.R) * (other.x - one.x)
-        ones = vec3(U(1.0), U(1.0), U(1.0))
-        reach = margin + U(slack) * (wp.dot(one.size, ones) + wp.dot(other.size, ones))
+        reach = margin + U(slack) * wp.dot(one.size + other.size, vec3(U(1.0), U(1.0), U(1.0)))
         number = int(APART)
         best = U(-1e30)
         for k in range(6):
@@ -76,6 +75,7 @@ def box_contacts(U: type) -> SimpleNamespace:
         face = best
         face_number = number
         axis = vec3()
+        edges, bias = int(EDGES), U(EDGE_BIAS)  # here, as Warp reads a named constant only where it first appears
         for k in range(9):
             e = vec3()
             e[k // 3] = U(1.0)
@@ -86,16 +86,14 @@ def box_contacts(U: type) -> SimpleNamespace:
                 gap = wp.abs(wp.dot(n, d)) - extent(one.size, n) - extent(other.size, wp.transpose(Q) * n)
                 if gap > reach:
                     return APART, d
-                if gap > face and gap - U(EDGE_BIAS) * wp.abs(gap) > best:
+                if gap > face and gap - bias * wp.abs(gap) > best:
                     best = gap
-                    number = EDGES + k
+                    number = edges + k
                     axis = n
-        normal = vec3()
-        if face_number < 3:
-            normal[face_number] = U(1.0)
-        else:
-            normal = column(Q, face_number - 3)
-        if wp.abs(wp.dot(axis, normal)) > U(ALIAS) and best < face + U(ALIAS_BIAS) * wp.abs(face) + U(TINY):
+        cosine = axis[face_number % 3]
+        if face_number > 2:
+            cosine = wp.dot(axis, column(Q, face_number - 3))
+        if wp.abs(cosine) > U(ALIAS) and best < face + U(ALIAS_BIAS) * wp.abs(face) + U(TINY):
             number = face_number
         return number, wp.sign(wp.dot(axis, d)) * (one.R * axis)
 
@@ -129,8 +127,7 @@ def box_contacts(U: type) -> SimpleNamespace:
             p = corner(centre, du, dv, k)
             q = corner(centre, du, dv, k + 1)
             D = q - p
-            m_p = vec3()
-            m_q = vec3()
+            m_p, m_q = vec3(), vec3()
             outside = int(0)
             for side in range(4):
                 i = side // 2
@@ -167,12 +164,8 @@ def box_contacts(U: type) -> SimpleNamespace:
 
     @wp.func
     def face_contacts(ref: Geom, inc: Geom, axis: int, side: U, found: Touches):
-        """Find the corners of the box inc on the face of the box ref with this axis; returns their number.
-
-        The normal is the face's own, outward, or minus that: side is 1 if ref is the first box, else -1.
-        """
-        x = (axis + 1) % 3
-        y = (axis + 2) % 3
+        """Find the corners of the box inc on a face of ref, the first box if side is 1, else -1; returns their number."""
+        x, y = (axis + 1) % 3, (axis + 2) % 3
         N = column(ref.R, axis)
         N = wp.sign(wp.dot(N, inc.x - ref.x)) * N
         back = wp.matrix_from_cols(column(ref.R, x), column(ref.R, y), N)
@@ -180,8 +173,7 @@ def box_contacts(U: type) -> SimpleNamespace:
         R = wp.transpose(back) * inc.R
         facing = R[2]
         g = int(wp.argmax(wp.abs(facing)))
-        u = (g + 1) % 3
-        v = (g + 2) % 3
+        u, v = (g + 1) % 3, (g + 2) % 3
         centre = wp.transpose(back) * (inc.x - ref.x) - wp.sign(facing[g]) * inc.size[g] * column(R, g)
         centre[2] = centre[2] - ref.size[axis]
         du = inc.size[u] * column(R, u)

@@ -36,7 +36,7 @@ class KernelSpec:
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
     constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
     spheres: int = 0  # with constraints, the most contact spheres of a lane
-    pairs: int = 0  # number of blocks of rows between two bodies (pairs.py), and
+    pairs: int = 0  # number of blocks of rows between two bodies (kernels/pairs), and
     pair_sizes: PairSizes = PairSizes()
 
     def has(self, names: str) -> list[bool]:
