@@ -34,7 +34,6 @@ PER_TASK = {
     "ant":          ((128, 64, 32), 128, 32, 4e-3, True,  2000),
     "humanoid":     ((256, 128),    128, 32, 2e-3, True,  2000),
     "humanoid_mtu": ((512, 256),    128, 16, 2e-3, True,  2000),
-    "humanoid_imitation": ((256, 128),    128, 32, 2e-3, True,  2000),
 }
 # fmt: on
 BETAS = 0.7, 0.95  # Adam's decay rates of the gradient's first and second moment
@@ -62,7 +61,7 @@ class Args(Flags):
     """initial learning rate (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        return dict(zip(COLUMNS, PER_TASK[self.task], strict=True)) if self.task in PER_TASK else {}
+        return dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
 
 
 # Network --------------------------------------------------------------------------------------------------------------
@@ -80,7 +79,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not noiseless)
 
     def sample_noise(self, *shape: int) -> Tensor:
-        """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
+        """Draw reparameterised noise (*shape, action_dim) of a rollout, differentiable in log_std (A.1)."""
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
@@ -141,7 +140,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def bptt_loss(reward: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 8 without its value, of (H, N) steps: the discount restarts after each done."""
+    """Compute Eq. 8 without its value, of (H, N) steps: the discount restarts after each done."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)

@@ -91,7 +91,7 @@ class Args(Flags):
     """weight of the entropy bonus, which keeps the policy's noise from vanishing (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, PER_TASK["humanoid"]), strict=True))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, PER_TASK["humanoid"]), strict=True))
         if self.device == "cpu":
             values |= {name: min(values[name], most) for name, most in CPU.items()}
         return values | {"eval_every": 500, "save_every": 500}
@@ -116,7 +116,7 @@ class Mixture:
         self.loc, self.log_std = loc, log_std  # (..., m, n) or (m, n)
 
     def sample(self) -> Tensor:
-        """Actions (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
+        """Draw actions (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
         noise, std = torch.randn_like(self.logits[..., 0]), self.log_std.exp()
         if self.logits.shape[-1] == 1:  # a Gaussian
             return self.loc.squeeze(-1) + std.squeeze(-1) * noise
@@ -127,17 +127,17 @@ class Mixture:
         return loc + scale * noise
 
     def log_density(self, action: Tensor) -> Tensor:
-        """Of each action by itself (..., m)."""
+        """Compute the log density of each action by itself (..., m)."""
         rate = (-self.log_std).exp() * math.sqrt(0.5)
         z = torch.addcmul(-self.loc * rate, action.unsqueeze(-1), rate)
         return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
 
     def log_prob(self, action: Tensor) -> Tensor:
-        """log pi(a|s) (...) of actions (..., m)."""
+        """Compute log pi(a|s) (...) of actions (..., m)."""
         return self.log_density(action).sum(-1)
 
     def entropy(self) -> Tensor:
-        """Of the weights (appendix B), summed over the actions (...); of a single component its differential one."""
+        """Sum the weights' entropy (appendix B) over the actions (...), or a single component's differential one."""
         if self.logits.shape[-1] == 1:
             return (self.log_std + (1 + math.log(2 * math.pi)) / 2).sum((-1, -2))
         return -(self.log_weight.exp() * self.log_weight).sum((-1, -2))
@@ -152,60 +152,85 @@ class Bins(Mixture):
 
 
 def logsumexp(x: Tensor) -> Tensor:
-    """Over the last dimension. torch's own takes several times as long on a CPU where an exponential underflows."""
+    """Sum over the last dimension. torch's takes several times as long on a CPU where an exponential underflows."""
     largest = x.detach().argmax(-1, keepdim=True)
     return (x.gather(-1, largest) - F.log_softmax(x, -1).gather(-1, largest)).squeeze(-1)
 
 
-class Head(nn.Module):
-    """Features of a network (..., inputs) -> the mixture of each of m actions. What of it depends on the state:
+# A head takes features of a network (..., inputs) to the mixture of each of m actions. Its `layers` take them to the
+# locations of the largest weights.
 
-    pfpn      the weights (Figure 2)
-    discrete  the weights; the components are points, which stay where they are
-    gmm       weights, locations and scales
-    gaussian  the location of its only component, with --std state its scale too
-    """
+
+class ParticleHead(nn.Module):
+    """PFPN: the weights depend on the state, locations and scales are the same in all states (Figure 2)."""
+
+    mixture: type[Mixture] = Mixture
+    moving: bool = True  # locations and scales are trained
 
     def __init__(self, args: Args, inputs: int, actions: int) -> None:
         super().__init__()
-        self.policy, self.shape = args.policy, (actions, 1 if args.policy == "gaussian" else args.particles)
-        self.scale: nn.Linear | None = None
+        self.shape = actions, args.particles
         loc, log_std = spread(*self.shape, args.initial_log_std)
-        if self.policy == "gaussian":
-            self.linear, first = nn.Linear(inputs, actions), torch.full(self.shape, args.initial_log_std or 0.0)
-            if args.std == "own":
-                self.log_std = nn.Parameter(first)
-            else:
-                self.scale = almost_constant(inputs, first)
-        elif self.policy == "gmm":
-            self.linear = almost_constant(inputs, torch.stack((torch.zeros_like(loc), loc)))
-            self.scale = almost_constant(inputs, log_std)
-            self.likeliest = Likeliest(*self.shape, shared=False)
-        else:
-            moving = self.policy == "pfpn"
-            self.linear, self.likeliest = almost_constant(inputs, torch.zeros_like(loc)), Likeliest(*self.shape)
-            self.loc.requires_grad_(moving).data.copy_(loc)
-            self.log_std = nn.Parameter(log_std if moving else log_std.fill_(-math.inf), requires_grad=moving)
+        self.linear, self.likeliest = almost_constant(inputs, torch.zeros_like(loc)), Likeliest(*self.shape)
+        self.layers = [self.linear, self.likeliest]
+        self.loc.requires_grad_(self.moving).data.copy_(loc)
+        self.log_std = nn.Parameter(log_std if self.moving else log_std.fill_(-math.inf), self.moving)
 
     @property
     def loc(self) -> nn.Parameter:
-        """(m, n) with pfpn and discrete."""
         return self.likeliest.get_parameter("loc")
 
     def forward(self, features: Tensor) -> Mixture:
-        out = self.linear(features)
-        if self.policy == "gaussian":
-            logits, loc = torch.zeros_like(out).unsqueeze(-1), out.unsqueeze(-1)
-        elif self.policy == "gmm":
-            logits, loc = out.unflatten(-1, (2, *self.shape)).unbind(-3)
-        else:
-            logits, loc = out.unflatten(-1, self.shape), self.loc
-        log_std = self.scale(features).unflatten(-1, self.shape).clamp(*LOG_STD) if self.scale else self.log_std
-        return (Bins if self.policy == "discrete" else Mixture)(logits, loc, log_std)
+        return self.mixture(self.linear(features).unflatten(-1, self.shape), self.loc, self.log_std)
+
+
+class DiscreteHead(ParticleHead):
+    """DISCRETE: the components are points, which stay where they are."""
+
+    mixture, moving = Bins, False
+
+
+class MixtureHead(nn.Module):
+    """GMM: weights, locations and scales depend on the state."""
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        self.shape = actions, args.particles
+        loc, log_std = spread(*self.shape, args.initial_log_std)
+        self.linear = almost_constant(inputs, torch.stack((torch.zeros_like(loc), loc)))
+        self.scale = almost_constant(inputs, log_std)
+        self.layers = [self.linear, Likeliest(*self.shape, shared=False)]
+
+    def forward(self, features: Tensor) -> Mixture:
+        logits, loc = self.linear(features).unflatten(-1, (2, *self.shape)).unbind(-3)
+        return Mixture(logits, loc, self.scale(features).unflatten(-1, self.shape).clamp(*LOG_STD))
+
+
+class GaussianHead(nn.Module):
+    """A Gaussian: its location depends on the state, with --std state its scale, too."""
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        self.shape, first = (actions, 1), torch.full((actions, 1), args.initial_log_std or 0.0)
+        self.linear = nn.Linear(inputs, actions)
+        self.layers = [self.linear]
+        self.scale = almost_constant(inputs, first) if args.std == "state" else None
+        if self.scale is None:
+            self.log_std = nn.Parameter(first)
+
+    def forward(self, features: Tensor) -> Mixture:
+        loc = self.linear(features).unsqueeze(-1)
+        log_std = self.log_std if self.scale is None else self.scale(features).unsqueeze(-1).clamp(*LOG_STD)
+        return Mixture(torch.zeros_like(loc), loc, log_std)
+
+
+Head = ParticleHead | MixtureHead | GaussianHead
+HEADS: dict[str, type[Head]]
+HEADS = {"pfpn": ParticleHead, "gaussian": GaussianHead, "gmm": MixtureHead, "discrete": DiscreteHead}
 
 
 def spread(actions: int, n: int, log_std: float | None = None) -> tuple[Tensor, Tensor]:
-    """Locations that cover each action evenly, and log standard deviations that cover the gaps between them (m, n).
+    """Return locations that cover each action evenly, and log standard deviations that cover their gaps (m, n).
 
     They cover [-1, 1], or as much as gives their mixture with equal weights a log standard deviation.
     """
@@ -219,7 +244,7 @@ def spread(actions: int, n: int, log_std: float | None = None) -> tuple[Tensor, 
 
 
 def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
-    """A layer that begins with small weights around an output."""
+    """Make a layer that begins with small weights around an output."""
     layer = nn.Linear(inputs, output.numel())
     nn.init.trunc_normal_(layer.weight, std=0.01, a=-0.02, b=0.02)
     layer.bias.data.copy_(output.flatten())
@@ -234,7 +259,7 @@ class Actor(nn.Module):
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.body = mlp(obs_dim, args.hidden, None, nn.ELU, columns=seen)
-        self.head = Head(args, args.hidden[-1], action_dim)
+        self.head = HEADS[args.policy](args, args.hidden[-1], action_dim)
         self.value = nn.Linear(args.hidden[-1], 1)
 
     def forward(self, obs: Tensor) -> tuple[Mixture, Tensor]:
@@ -242,9 +267,8 @@ class Actor(nn.Module):
         return self.head(features), self.value(features).squeeze(-1)
 
     def deterministic(self) -> nn.Sequential:
-        """The locations of the largest weights, of observations as they come, with the same weights."""
-        likeliest = [] if self.head.policy == "gaussian" else [self.head.likeliest]
-        return nn.Sequential(self.normalizer, *self.body, self.head.linear, *likeliest)
+        """Return the locations of the largest weights, of observations as they come, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.body, *self.head.layers)
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
@@ -255,7 +279,7 @@ class Resampling(nn.Module):
 
     def __init__(self, args: Args, head: Head) -> None:
         super().__init__()
-        self.args, self.active = args, args.policy == "pfpn"  # the other policies have nothing to move
+        self.args, self.active = args, type(head) is ParticleHead  # others have nothing to move
         self.seen: Tensor = nn.Buffer(torch.zeros(2, *head.shape))  # since the last one: sum and largest of weights
         self.age: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # iterations
         self.moved: Tensor = nn.Buffer(torch.zeros(()))  # particles, ever
@@ -270,7 +294,7 @@ class Resampling(nn.Module):
     @torch.no_grad()
     def end_iteration(self, head: Head, optimizer: ClippedAdam) -> dict[str, Tensor]:
         """Resample if it is time; that is decided on the device, so a captured iteration does the same."""
-        if not self.active:
+        if type(head) is not ParticleHead:
             return {}
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
@@ -290,7 +314,7 @@ class Resampling(nn.Module):
             "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
         }
 
-    def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
+    def move(self, head: ParticleHead, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
         """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
 
         |D| copies share the weight of their target: log(|D| + 1) less in each logit. Adam's moments of them are zeroed.
@@ -311,19 +335,6 @@ class Resampling(nn.Module):
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
-
-
-class Rollout(NamedTuple):
-    """What happened in a rollout, time first: (H, N, ...)."""
-
-    obs: Tensor  # s_t, on which the policy acted
-    next_obs: Tensor  # s_{t+1}, before any reset
-    action: Tensor  # before it is clipped to [-1, 1]
-    log_prob: Tensor
-    value: Tensor  # V(s_t), normalized
-    reward: Tensor
-    terminated: Tensor
-    done: Tensor  # terminated or truncated
 
 
 class Batch(NamedTuple):
@@ -365,7 +376,7 @@ class PPO:
 
     @torch.no_grad()
     def sample(self) -> tuple[Batch, dict[str, Tensor]]:
-        """Act for a rollout: its samples with their advantages and value targets, and metrics."""
+        """Act for a rollout; returns its samples with their advantages and value targets, and metrics."""
         args, normalizer, steps, obs = self.args, self.actor.normalizer, [], self.env.detach()
         for _ in range(args.horizon):
             mixture, value = self.actor(normalizer(obs))
@@ -375,17 +386,18 @@ class PPO:
             ends = terminated, terminated | truncated
             steps.append((obs, info["final_obs"], action, mixture.log_prob(action), value, reward, *ends))
             obs = next_obs
-        rollout = Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
-        mixture, next_value = self.actor(normalizer(rollout.next_obs))
-        next_value = self.return_normalizer.inverse(next_value).masked_fill(rollout.terminated, 0.0)
-        target = td_lambda(rollout.reward, next_value, rollout.done, args.gamma, GAE_LAMBDA)
-        advantage = target - self.return_normalizer.inverse(rollout.value)
+        rollout = (torch.stack(tensors) for tensors in zip(*steps, strict=True))  # (H, N, ...)
+        obs, next_obs, action, log_prob, value, reward, terminated, done = rollout
+        mixture, next_value = self.actor(normalizer(next_obs))
+        next_value = self.return_normalizer.inverse(next_value).masked_fill(terminated, 0.0)
+        target = td_lambda(reward, next_value, done, args.gamma, GAE_LAMBDA)
+        advantage = target - self.return_normalizer.inverse(value)
         explained = 1 - advantage.var() / target.var()
         self.return_normalizer.update(target)
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
-        samples = normalizer(rollout.obs), rollout.action, rollout.log_prob, advantage, self.return_normalizer(target)
-        normalizer.update(rollout.obs)
+        samples = normalizer(obs), action, log_prob, advantage, self.return_normalizer(target)
+        normalizer.update(obs)
         found = {"losses/entropy": mixture.entropy().mean(), "losses/explained_variance": explained}
         return Batch(*(tensor.flatten(0, 1) for tensor in samples)), found
 
@@ -415,7 +427,7 @@ class PPO:
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, to a done or the rollout's end: the value and the generalized advantage.
+    """Compute TD(lambda) of (H, N) steps, to a done or the rollout's end: value plus generalized advantage.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """

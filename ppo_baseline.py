@@ -19,8 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.symmetry.mirror import Mirror
-from diffsim.symmetry.networks import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.symmetry.networks import make_alike
 from diffsim.training import Run, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp, moments
@@ -38,11 +37,8 @@ PER_TASK = {
     "ant":          ((128, 64, 32),  2048,  32, 16384, 5, 0.01,  5000),
     "humanoid":     ((256, 128, 64), 1024,  32,  8192, 5, 0.0,   5000),
     "humanoid_mtu": ((512, 512, 256), 1024, 32,  8192, 6, 0.0,  20000),
-    "humanoid_imitation": ((256, 128, 64), 1024, 32, 8192, 5, 0.0, 5000),
-    "g1_track":     ((512, 256, 128), 4096, 24, 24576, 5, 0.0,   5000),
 }
 # fmt: on
-BALANCING = {"g1_track": {"initial_log_std": -1.0}}  # more noise throws it over
 CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more of each
 MAX_GRAD_NORM = 1.0
 TARGET_KL = 0.008  # the learning rate falls if a minibatch's KL divergence is above twice this, rises below half of it
@@ -84,10 +80,10 @@ class Args(Flags):
     """treat left and right alike: a mirrored state gets the mirrored action (per task; docs/sapo.md)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
-        return super().task_defaults() | values | BALANCING.get(self.task, {})
+        return values
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -106,18 +102,8 @@ class ActorCritic(nn.Module):
         self.mean, self.value = (nn.Sequential(nn.Linear(args.hidden[-1], n)) for n in (action_dim, 1))
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
 
-    def make_alike(self, mirror: Mirror) -> None:
-        """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
-        mirror_statistics(self.normalizer, mirror.obs)
-        for features in (self.features, self.own):
-            if features is not None:
-                mirror_inputs(features, mirror.obs)
-        mirror_outputs(self.mean, mirror.action)
-        mirror_outputs(self.value, mirror.value)
-        mirror_parameter(self, "log_std", mirror.action)
-
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
+        """Return the mean (..., action_dim) and the normalized value (...) of normalized observations."""
         features = self.features(obs)
         return self.mean(features), self.value(features if self.own is None else self.own(obs)).squeeze(-1)
 
@@ -159,7 +145,8 @@ class PPO:
         self.args, self.env = args, env
         self.actor_critic = ActorCritic(args, env).to(env.device)
         if args.symmetric:
-            self.actor_critic.make_alike(env.task.mirror)
+            both = self.actor_critic
+            make_alike(env.task.mirror, both, (both.features, both.own), both.mean, both.value)
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, MAX_GRAD_NORM, lr=args.lr)
@@ -181,7 +168,7 @@ class PPO:
 
     @torch.no_grad()
     def act(self) -> tuple[Batch, Tensor]:
-        """Act for a rollout: its samples, and the share of the returns' variance that their values explain."""
+        """Act for a rollout; returns its samples, and the share of the returns' variance that their values explain."""
         args, policy, normalizer = self.args, self.actor_critic, self.actor_critic.normalizer
         noise = torch.randn(args.horizon, self.env.num_envs, policy.log_std.numel(), device=self.env.device)
         rollout = collect(self.env, policy, noise)
@@ -239,7 +226,7 @@ def collect(env: DiffEnv, policy: ActorCritic, noise: Tensor) -> Rollout:
 
 
 def gae(reward: Tensor, value: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at the dones and at the rollout's end.
+    """Compute advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at dones and at the rollout's end.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """
@@ -251,25 +238,25 @@ def gae(reward: Tensor, value: Tensor, next_value: Tensor, done: Tensor, gamma: 
 
 
 def log_ratio(batch: Batch, mean: Tensor, log_std: Tensor, old_log_std: Tensor) -> Tensor:
-    """log pi(a|s) / pi_old(a|s) (B,)."""
+    """Compute log pi(a|s) / pi_old(a|s) (B,)."""
     new = ((batch.action - mean) / log_std.exp()).square() / 2 + log_std
     old = ((batch.action - batch.mean) / old_log_std.exp()).square() / 2 + old_log_std
     return (old - new).sum(-1)
 
 
 def kl_divergence(old_mean: Tensor, old_log_std: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """KL(pi_old || pi) of diagonal Gaussians, mean over states."""
+    """Compute KL(pi_old || pi) of diagonal Gaussians, mean over states."""
     ratio = ((2 * old_log_std).exp() + (old_mean - mean).square()) / (2 * log_std).exp()
     return (log_std - old_log_std + (ratio - 1) / 2).sum(-1).mean()
 
 
 def clipped_loss(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
-    """Minus the clipped surrogate objective (Eq. 7), of pi(a|s) / pi_old(a|s) (B,)."""
+    """Compute minus the clipped surrogate objective (Eq. 7), of pi(a|s) / pi_old(a|s) (B,)."""
     return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
 
 
 def entropy(log_std: Tensor) -> Tensor:
-    """Of a diagonal Gaussian, in nats."""
+    """Compute the entropy of a diagonal Gaussian, in nats."""
     return (log_std + (1 + math.log(2 * math.pi)) / 2).sum(-1)
 
 

@@ -18,10 +18,11 @@ from typing import Any, Literal, NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from diffsim import DiffEnv
 from diffsim.sim.integration import Integration
-from diffsim.symmetry.networks import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.symmetry.networks import make_alike
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, mlp
@@ -38,24 +39,17 @@ PER_TASK = {
     "ant":          ((128, 64, 32), (64, 64),   2e-3, 0.2,  64, 1200, 16, 2, 0.3),
     "humanoid":     ((256, 128),    (128, 128), 5e-4, 0.9,  64,  800, 4, 4, 0.5),
     "humanoid_mtu": ((512, 256),    (256, 256), 5e-4, 0.9,  64,  400, 4, 4, 0.5),
-    "go2":          ((256, 128),    (256, 128), 1e-3, 0.9,  64,  400, 4, 4, 0.5),
-    "g1":           ((256, 128),    (256, 128), 1e-3, 0.9,  64,  600, 4, 4, 0.5),
-    "g1_track":     ((256, 128),    (512, 256), 1e-3, 0.9, 256,  400, 8, 4, 0.5),
 }
-PER_TASK |= {"walker": PER_TASK["hopper"], "swimmer": PER_TASK["half_cheetah"], "go1": PER_TASK["go2"]}
-PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
+PER_TASK |= {"walker": PER_TASK["hopper"], "swimmer": PER_TASK["half_cheetah"]}
 SOME, MANY = {"num_envs": 256}, {"num_envs": 1024}
 ON_GPU: dict[str, dict[str, Any]] = dict.fromkeys(("half_cheetah", "ant"), SOME)
 ON_GPU["cartpole"] = SOME | {"critic_iterations": 16, "critic_lr": 2e-3}
-ON_GPU |= dict.fromkeys(("go1", "go2", "g1", "g1_track"), MANY)
-ON_GPU |= dict.fromkeys(("hopper", "humanoid", "humanoid_mtu", "humanoid_imitation"), MANY | {"critic_iterations": 8})
+ON_GPU |= dict.fromkeys(("hopper", "humanoid", "humanoid_mtu"), MANY | {"critic_iterations": 8})
 INTEGRATION = {"ant": Integration("soft", 8, implicit=True)}  # SAPO's cheaper steps
 INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), Integration("soft", 16, implicit=True))
-MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}  # MuJoCo's contact, whose gradients agree over few steps
-# Robots with servos, on MuJoCo's contact, begin near their standing pose: little noise, actions near zero.
-BEGIN = {"horizon": 16, "initial_log_std": -2.0, "adjoint_clip": 5.0}
-STANDING = dict.fromkeys(("go1", "go2"), BEGIN)
-STANDING |= dict.fromkeys(("g1", "g1_track"), BEGIN | {"initial_log_std": -3.0})
+# On MuJoCo's contact, whose gradients agree over few steps, with four times the environments (docs/transfer.md).
+MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}
+ONSET = {"half_cheetah": {"onset": (0.02, 0.005), "horizon": 16, "adjoint_clip": 3.0}}  # soft first
 # fmt: on
 GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
 CRITIC_MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
@@ -102,14 +96,14 @@ class Args(Flags):
     """clip gradients with respect to a state to this many times the batch's median (per task; 0: do not clip)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         if self.device != "cpu":
-            values |= ON_GPU.get(self.task, {})
+            values |= ON_GPU.get(self.like, {})
         if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
             _, values["substeps"], values["implicit"], *_ = INTEGRATION[self.task]
-        if self.contact == "mujoco" and self.task not in STANDING:
-            values |= MUJOCO | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
-        return super().task_defaults() | values | STANDING.get(self.task, {})
+        if self.contact == "mujoco":
+            values |= MUJOCO | ONSET.get(self.task, {}) | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
+        return values
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -120,14 +114,17 @@ class Actor(nn.Module):
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
-        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.normalizer = ObsNormalizer(obs_dim)
-        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, ELU, norm=True, columns=env.task.actor_dim)
-        if args.task in STANDING:
-            with torch.no_grad():
-                self.mean[-1].get_parameter("weight").mul_(0.01)
-                self.mean[-1].get_parameter("bias").zero_()
+        task, action_dim = env.task, env.scene.nu
+        self.normalizer = ObsNormalizer(task.obs_dim)
+        options: dict[str, Any] = dict(columns=task.actor_dim, gain=task.initial_gain)
+        self.mean = mlp(task.obs_dim, args.actor_hidden, action_dim, ELU, norm=True, **options)
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
+
+    @property
+    def deviation(self) -> Tensor:
+        """Return the numbers of log_std themselves, also where it is computed from them (--symmetric)."""
+        own = "parametrizations.log_std.original" if parametrize.is_parametrized(self, "log_std") else "log_std"
+        return self.get_parameter(own)
 
     def forward(self, obs: Tensor, noise: Tensor) -> Tensor:
         return torch.tanh(self.mean(self.normalizer(obs)) + noise)
@@ -167,22 +164,11 @@ class RPO:
         self.actor = Actor(args, env).to(env.device)
         self.critic = mlp(env.task.obs_dim, args.critic_hidden, 1, ELU, norm=True, orthogonal=True).to(env.device)
         if args.symmetric:
-            self.make_alike()
+            make_alike(env.task.mirror, self.actor, (self.actor.mean, self.critic), self.actor.mean, self.critic)
         self.policy = self.actor.deterministic()
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS)
         self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
-        # The deviation's own numbers, also where log_std is computed from them (--symmetric).
-        (self.deviation,) = (p for name, p in self.actor.named_parameters() if "log_std" in name)
-
-    def make_alike(self) -> None:
-        """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
-        mirror = self.env.task.mirror
-        mirror_statistics(self.actor.normalizer, mirror.obs)
-        for network, output in ((self.actor.mean, mirror.action), (self.critic, mirror.value)):
-            mirror_inputs(network, mirror.obs)
-            mirror_outputs(network, output)
-        mirror_parameter(self.actor, "log_std", mirror.action)
 
     def iterate(self) -> dict[str, Tensor]:
         """Act for a rollout, take its gradient once, descend it several times, fit the critic; returns metrics.
@@ -239,8 +225,8 @@ class RPO:
             kl = kl_divergence(b.mean, old_std, mean, std)
             gradient = optimizer.gradient(count * change + args.kl_coef * kl)
             metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
-            once = once or [self.deviation.detach().clone()]
-        self.deviation.detach().copy_(once[0])
+            once = once or [self.actor.deviation.detach().clone()]
+        self.actor.deviation.detach().copy_(once[0])
         return dict(
             zip(("losses/approx_kl", "losses/clipfrac", "grad/norm"), torch.stack(metrics).mean(0), strict=True)
         )
@@ -280,7 +266,7 @@ def surrogate(bound: str, trust: float, b: Batch, mean: Tensor, std: Tensor, old
 
 
 def kl_divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """KL(pi_old || pi) of diagonal Gaussians, mean over states."""
+    """Compute KL(pi_old || pi) of diagonal Gaussians, mean over states."""
     ratio = (old_std.square() + (old_mean - mean).square()) / std.square()
     return ((std / old_std).log() + (ratio - 1) / 2).sum(-1).mean()
 
@@ -296,7 +282,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
+    """Compute SHAC's Eq. 5 of (H, N) steps: dones cut the rollouts, and the discount restarts after them."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)
@@ -308,7 +294,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
+    """Compute TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))

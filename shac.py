@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.symmetry.networks import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.symmetry.networks import make_alike
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import Chain, mlp
@@ -37,18 +37,7 @@ PER_TASK = {
     "ant":          ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,    64, 2000),
     "humanoid":     ((256, 128),    (128, 128), 2e-3, 5e-4, 0.995,  64, 2000),
     "humanoid_mtu": ((512, 256),    (256, 256), 2e-3, 5e-4, 0.995,  64, 2000),
-    # Not in the paper:
-    "humanoid_imitation": ((256, 128), (128, 128), 2e-3, 5e-4, 0.995, 64, 2000),
-    "go1":          ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9,    64,  600),
-    "go2":          ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9,    64,  600),
-    "g1":           ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9,    64, 1500),
-    "g1_track":     ((256, 128),    (512, 256), 2e-3, 1e-3, 0.9,   256, 1500),
 }
-# Robots with servos begin near their standing pose: little noise, actions near zero.
-STANDING = {"initial_log_std": -2.0, "adjoint_clip": 5.0}
-BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"), STANDING | {"horizon": 16})
-GAIN = dict.fromkeys(BEGINNING, 0.01)  # factor of the weights of the actor's last layer at first, otherwise 1
-ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  # where environments cost little
 # fmt: on
 MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of both optimizers; Adam's decay rates of the gradient's moments
 FINAL_LR = 1e-5  # both learning rates reach it, linearly, after the last iteration
@@ -84,21 +73,19 @@ class Args(Flags):
     target_alpha: Fraction = 0.995
     """target critic <- alpha target critic + (1 - alpha) critic, each iteration (per task)"""
     general_hyperparameters: bool = False
-    """one setting for all tasks (Table 5) instead of the per-task ones"""
+    """one setting for all of the paper's tasks (Table 5) instead of the per-task ones"""
     symmetric: bool = False
     """treat left and right alike: a mirrored state gets the mirrored action (per task; docs/sapo.md)"""
     adjoint_clip: NonNegative = 0.0
     """clip gradients with respect to a state to this many times the batch's median (per task; 0: do not clip)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.task], strict=True)) if self.task in PER_TASK else {}
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         if self.general_hyperparameters:
             values = {name: value for name, value in values.items() if name == "iterations"}
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
             values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
-        if self.device != "cpu":
-            values |= ON_GPU.get(self.task, {})
-        return super().task_defaults() | values | BEGINNING.get(self.task, {})
+        return values
 
     def check(self) -> None:
         super().check()
@@ -116,15 +103,12 @@ class Actor(nn.Module):
         super().__init__()
         obs_dim, action_dim, noiseless = env.task.obs_dim, env.scene.nu, args.initial_log_std == -math.inf
         self.normalizer = ObsNormalizer(obs_dim)
-        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, ELU, True, noiseless, env.task.actor_dim)
-        if args.task in GAIN:
-            with torch.no_grad():
-                self.mean[-1].get_parameter("weight").mul_(GAIN[args.task])
-                self.mean[-1].get_parameter("bias").zero_()
+        options: dict[str, Any] = dict(orthogonal=noiseless, columns=env.task.actor_dim, gain=env.task.initial_gain)
+        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, ELU, norm=True, **options)
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not noiseless)
 
     def sample_noise(self, *shape: int) -> Tensor:
-        """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
+        """Draw reparameterised noise (*shape, action_dim) of a rollout, differentiable in log_std (A.1)."""
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
@@ -157,23 +141,14 @@ class SHAC:
         self.actor = Actor(args, env).to(env.device)
         self.critic = mlp(env.task.obs_dim, args.critic_hidden, 1, ELU, norm=True, orthogonal=True).to(env.device)
         if args.symmetric:
-            self.make_alike()
+            make_alike(env.task.mirror, self.actor, (self.actor.mean, self.critic), self.actor.mean, self.critic)
         self.policy = self.actor.deterministic()
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, BETAS)
         self.critic_optimizer = ClippedAdam(self.critic, MAX_GRAD_NORM, BETAS)
 
-    def make_alike(self) -> None:
-        """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
-        mirror = self.env.task.mirror
-        mirror_statistics(self.actor.normalizer, mirror.obs)
-        for network, output in ((self.actor.mean, mirror.action), (self.critic, mirror.value)):
-            mirror_inputs(network, mirror.obs)
-            mirror_outputs(network, output)
-        mirror_parameter(self.actor, "log_std", mirror.action)
-
     def iterate(self) -> dict[str, Tensor]:
-        """One iteration of Algorithm 1; returns metrics.
+        """Take one iteration of Algorithm 1; returns metrics.
 
         It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
         """
@@ -208,7 +183,7 @@ class SHAC:
         }
 
     def next_values(self, rollout: Rollout) -> Tensor:
-        """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
+        """Return V(s_{t+1}) (H, N): of the last state where an episode's time ran out, zero where it terminated."""
         if self.args.critic_iterations == 0:
             return torch.zeros_like(rollout.reward)
         values = self.target(self.actor.normalizer(rollout.next_obs)).squeeze(-1)
@@ -238,7 +213,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 5 of (H, N) steps: each environment's rollout is cut at its dones, and the discount restarts after them."""
+    """Compute Eq. 5 of (H, N) steps: dones cut an environment's rollout, and the discount restarts after them."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)
@@ -250,7 +225,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the rollout's end does."""
+    """Compute Eq. 7 of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))

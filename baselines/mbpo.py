@@ -43,7 +43,6 @@ PER_TASK = {
     "humanoid":     ((512, 256),           (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
     "humanoid_mtu": ((512, 512, 512, 256), (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
 }
-PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # fmt: on
 MAX_GRAD_NORM = 100.0  # gradients of large values reach it
 MODELS, ELITES = 7, 5  # networks of the ensemble; those that predict held-out transitions best make the rollouts
@@ -101,7 +100,7 @@ class Args(Flags):
     """discount factor"""
 
     def task_defaults(self) -> dict[str, Any]:
-        own = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        own = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         return own | {"save_every": 500}  # a checkpoint holds the buffers
 
     def check(self) -> None:

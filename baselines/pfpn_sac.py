@@ -89,7 +89,7 @@ class Args(Flags):
     """transitions in the replay buffer, over all environments"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, PER_TASK["humanoid"]), strict=True))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, PER_TASK["humanoid"]), strict=True))
         rare = {"eval_every": 500, "save_every": 500}  # a checkpoint holds the replay buffer
         return values | rare | {"critic_hidden": values["hidden"]}
 
@@ -110,81 +110,93 @@ class Mixture:
         self.loc, self.log_std = loc, log_std  # (..., m, n) or (m, n)
 
     def sample(self) -> Tensor:
-        """u (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
+        """Draw u (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
         noise = torch.randn_like(self.logits[..., 0])
         if self.logits.shape[-1] == 1:  # a Gaussian
             return self.loc.squeeze(-1) + self.log_std.exp().squeeze(-1) * noise
         return self.pick(self.choose(), noise)
 
     def choose(self) -> Tensor:
-        """A component (..., m, 1) by its weight."""
+        """Draw a component (..., m, 1) by its weight."""
         total = self.logits.detach().softmax(-1).cumsum(-1)
         level = (1 - torch.rand_like(total[..., :1])) * total[..., -1:]
         return (total < level).sum(-1, keepdim=True)
 
     def pick(self, index: Tensor, noise: Tensor) -> Tensor:
-        """u (..., m) of the components (..., m, 1), with the gradient of their locations and scales."""
+        """Return u (..., m) of the components (..., m, 1), with the gradient of their locations and scales."""
         pair = self.loc, self.log_std.exp()
         loc, scale = (x.expand_as(self.logits).gather(-1, index).squeeze(-1) for x in pair)
         return loc + scale * noise
 
     def log_density(self, u: Tensor) -> Tensor:
-        """Of each u by itself (..., m)."""
+        """Compute the log density of each u by itself (..., m)."""
         rate = (-self.log_std).exp() * math.sqrt(0.5)
         z = torch.addcmul(-self.loc * rate, u.unsqueeze(-1), rate)
         return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
 
     def log_prob(self, u: Tensor) -> Tensor:
-        """log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
+        """Compute log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
         return (self.log_density(u) - log_slope(u)).sum(-1)
 
 
 def log_slope(u: Tensor) -> Tensor:
-    """log da/du."""
+    """Compute log da/du."""
     return 2 * (math.log(2) - u - F.softplus(-2 * u))
 
 
 def logsumexp(x: Tensor) -> Tensor:
-    """Over the last dimension. torch's own takes several times as long on a CPU where an exponential underflows."""
+    """Sum over the last dimension. torch's takes several times as long on a CPU where an exponential underflows."""
     largest = x.detach().argmax(-1, keepdim=True)
     return (x.gather(-1, largest) - F.log_softmax(x, -1).gather(-1, largest)).squeeze(-1)
 
 
-class Head(nn.Module):
-    """Features of a network (..., inputs) -> the mixture of each of m actions. What of it depends on the state:
+# A head takes features of a network (..., inputs) to the mixture of each of m actions. Its `layers` take them to u of
+# the largest weights.
 
-    pfpn      the weights (Figure 2)
-    gaussian  location and scale of its only component
-    """
+
+class ParticleHead(nn.Module):
+    """PFPN: the weights depend on the state, locations and scales are the same in all states (Figure 2)."""
 
     def __init__(self, args: Args, inputs: int, actions: int) -> None:
         super().__init__()
-        self.policy, self.shape = args.policy, (actions, args.particles if args.policy == "pfpn" else 1)
-        if self.policy == "gaussian":
-            self.linear, self.scale = nn.Linear(inputs, actions), nn.Linear(inputs, actions)
-        else:
-            loc, log_std = spread(*self.shape)
-            self.linear, self.likeliest = nn.Linear(inputs, loc.numel()), Likeliest(*self.shape)
-            nn.init.trunc_normal_(self.linear.weight, std=0.01, a=-0.02, b=0.02)  # almost constant
-            nn.init.zeros_(self.linear.bias)
-            self.loc.data.copy_(loc)
-            self.log_std = nn.Parameter(log_std)
+        self.shape = actions, args.particles
+        loc, log_std = spread(*self.shape)
+        self.linear, self.likeliest = nn.Linear(inputs, loc.numel()), Likeliest(*self.shape)
+        self.layers = [self.linear, self.likeliest]
+        nn.init.trunc_normal_(self.linear.weight, std=0.01, a=-0.02, b=0.02)  # almost constant
+        nn.init.zeros_(self.linear.bias)
+        self.loc.data.copy_(loc)
+        self.log_std = nn.Parameter(log_std)
 
     @property
     def loc(self) -> nn.Parameter:
-        """(m, n) the particles' locations."""
+        """Return the particles' locations (m, n)."""
         return self.likeliest.get_parameter("loc")
 
     def forward(self, features: Tensor) -> Mixture:
-        out = self.linear(features)
-        if self.policy == "gaussian":
-            log_std = self.scale(features).unsqueeze(-1).clamp(*LOG_STD)
-            return Mixture(torch.zeros_like(log_std), out.unsqueeze(-1), log_std)
-        return Mixture(out.unflatten(-1, self.shape), self.loc, self.log_std)
+        return Mixture(self.linear(features).unflatten(-1, self.shape), self.loc, self.log_std)
+
+
+class GaussianHead(nn.Module):
+    """A Gaussian, whose location and scale depend on the state."""
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        self.shape = actions, 1
+        self.linear, self.scale = nn.Linear(inputs, actions), nn.Linear(inputs, actions)
+        self.layers = [self.linear]
+
+    def forward(self, features: Tensor) -> Mixture:
+        loc, log_std = self.linear(features).unsqueeze(-1), self.scale(features).unsqueeze(-1).clamp(*LOG_STD)
+        return Mixture(torch.zeros_like(log_std), loc, log_std)
+
+
+Head = ParticleHead | GaussianHead
+HEADS: dict[str, type[Head]] = {"pfpn": ParticleHead, "gaussian": GaussianHead}
 
 
 def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
-    """Locations of u that cover each action evenly, and log standard deviations that cover their gaps (m, n)."""
+    """Return locations of u that cover actions evenly, and log standard deviations that cover their gaps (m, n)."""
     loc = torch.atanh(-1 + (2 * torch.arange(n, dtype=torch.float64) + 1) / n)
     gap = loc.diff()
     widest = torch.maximum(F.pad(gap, (1, 0)), F.pad(gap, (0, 1)))
@@ -199,16 +211,15 @@ class Actor(nn.Module):
         obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.body = mlp(obs_dim, args.hidden, None, nn.ReLU, columns=seen)
-        self.head = Head(args, args.hidden[-1], action_dim)
+        self.head = HEADS[args.policy](args, args.hidden[-1], action_dim)
 
     def forward(self, obs: Tensor) -> Mixture:
         mixture: Mixture = self.head(self.body(obs))
         return mixture
 
     def deterministic(self) -> nn.Sequential:
-        """The actions of the largest weights, of observations as they come, with the same weights."""
-        likeliest = [self.head.likeliest] if self.head.policy == "pfpn" else []
-        return nn.Sequential(self.normalizer, *self.body, self.head.linear, *likeliest, nn.Tanh())
+        """Return the actions of the largest weights, of observations as they come, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.body, *self.head.layers, nn.Tanh())
 
 
 class Draw(NamedTuple):
@@ -220,13 +231,13 @@ class Draw(NamedTuple):
 
 
 def reparameterised(mixture: Mixture) -> Draw:
-    """A sample of a Gaussian."""
+    """Draw a sample of a Gaussian."""
     u = mixture.sample()
     return Draw(u, mixture.log_prob(u))
 
 
 def straight_through(mixture: Mixture) -> Draw:
-    """A sample whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
+    """Draw a sample whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
     noise = torch.randn_like(mixture.logits[..., 0])
     scores = mixture.logits - torch.empty_like(mixture.logits).exponential_().log()  # Gumbel noise
     u = mixture.pick(scores.argmax(-1, keepdim=True), noise)
@@ -239,7 +250,7 @@ def straight_through(mixture: Mixture) -> Draw:
 
 
 def implicit(mixture: Mixture) -> Draw:
-    """Samples whose gradient has no bias.
+    """Draw samples whose gradient has no bias.
 
     The value's is implicit (Figurnov et al. 2018, https://arxiv.org/abs/1805.08498). Few samples fall between narrow
     particles, where that is large. Therefore a second sample has one of the m actions from all of (-1, 1). The
@@ -258,7 +269,7 @@ def implicit(mixture: Mixture) -> Draw:
 
 
 def shift(mixture: Mixture, u: Tensor) -> Tensor:
-    """0 (B, m), with the gradient that u has if its cumulative probability F(u) stays: du = -dF / p(u).
+    """Return 0 (B, m), with the gradient that u has if its cumulative probability F(u) stays: du = -dF / p(u).
 
     Both samples of `implicit` divide by the sum of the densities with which they come (Veach's balance heuristic),
     p(u) and that of a constant density 1/2 of actions, for one of m. So the gradient of tanh u is at most 2m times dF.
@@ -277,7 +288,7 @@ class Resampling(nn.Module):
 
     def __init__(self, args: Args, head: Head) -> None:
         super().__init__()
-        self.args, self.active = args, args.policy == "pfpn"  # a Gaussian has nothing to move
+        self.args, self.active = args, type(head) is ParticleHead  # a Gaussian has nothing to move
         self.seen: Tensor = nn.Buffer(torch.zeros(2, *head.shape))  # since the last one: sum and largest of weights
         self.age: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # iterations
         self.moved: Tensor = nn.Buffer(torch.zeros(()))  # particles, ever
@@ -292,7 +303,7 @@ class Resampling(nn.Module):
     @torch.no_grad()
     def end_iteration(self, head: Head, optimizer: ClippedAdam) -> dict[str, Tensor]:
         """Resample if it is time; that is decided on the device, so a captured iteration does the same."""
-        if not self.active:
+        if type(head) is not ParticleHead:
             return {}
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
@@ -310,7 +321,7 @@ class Resampling(nn.Module):
             "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
         }
 
-    def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
+    def move(self, head: ParticleHead, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
         """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
 
         |D| copies share the weight of their target: log(|D| + 1) less in each logit. Adam's moments of them are zeroed.

@@ -81,7 +81,7 @@ class Args(Flags):
     """normalize observations by their running mean and variance (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        own = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        own = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         return own | dict(zip(ORDER_COLUMNS, PER_ORDER[self.order], strict=True))
 
     def check(self) -> None:

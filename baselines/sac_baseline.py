@@ -40,7 +40,6 @@ PER_TASK = {
     "humanoid":     ((512, 256),            64, 2048, 2e-4, 3e-4, 256, 20_000),
     "humanoid_mtu": ((512, 512, 512, 256), 256, 4096, 2e-4, 3e-4, 256, 40_000),
 }
-PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # fmt: on
 # Chosen here, on hopper, ant and humanoid: on a GPU a step of 1,024 environments costs as much as one of 64.
 LARGE_BATCH: dict[str, Any] = {"num_envs": 1024, "batch_size": 8192, "updates_per_step": 4, "actor_updates": 2}
@@ -97,7 +96,7 @@ class Args(Flags):
     """many environments, large batches, layer-normalized critics: hopper, ant and humanoid in minutes of a GPU"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         if self.large_batch:
             values |= LARGE_BATCH | (CPU | {"iterations": 2000} if self.device == "cpu" else {})
         return values

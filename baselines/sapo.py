@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
 from diffsim.learning.ensemble import Ensemble, EnsembleAdam
-from diffsim.symmetry.networks import mirror_inputs, mirror_outputs, mirror_parameter, mirror_statistics
+from diffsim.symmetry.networks import make_alike
 from diffsim.tasks import TASKS
 from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
@@ -39,23 +39,16 @@ PER_TASK = {
     "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0, ( 0.0, -3.0), 16, 2048, 2500, 16),
     "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, (-0.5, -0.5),  4, 1024, 1200,  8),
     "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, (-0.5, -0.5),  2, 1024, 1400, 16),
-    "g1":           ((256, 128),    (256, 128), "silu", 2e-3, 1e-3, 0.9,  -2.0, (-1.0, -1.0),  1, 1024, 1200,  4),
-    "g1_track":     ((256, 128),    (512, 256), "silu", 2e-3, 1e-3, 0.9,  -2.0, (-1.0, -2.0),  1, 1024,  700,  8),
 }
-PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # Integrations that replace the papers' with --accuracy default.
 INTEGRATION = {name: TASKS[name].integration("fast") for name in ("hopper", "half_cheetah")}
 INTEGRATION |= {"ant": Integration("soft", 8, implicit=True)}
 INTEGRATION |= {name: Integration("soft", 16, implicit=True) for name in ("humanoid", "humanoid_mtu")}
-# Robots that fall before they learn to walk
-BALANCING: dict[str, dict[str, Any]] = {"g1": {"horizon": 16, "adjoint_clip": 5.0}, "g1_track": {"horizon": 16}}
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
 ON_CPU: dict[str, dict[str, Any]] = {
     "ant": {"iterations": 1500},
     "humanoid": {"critic_iterations": 4},
     "humanoid_mtu": {"critic_iterations": 4, "iterations": 1000},
-    "g1": {"iterations": 700},
-    "g1_track": {"critic_hidden": (256, 128), "critic_iterations": 4, "iterations": 1300},
 }
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
 # fmt: on
@@ -109,7 +102,7 @@ class Args(Flags):
     """clip gradients with respect to a state to this many times the batch's median (per task; 0: do not clip)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.task, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.like, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
             values |= ON_CPU.get(self.task, {})
@@ -120,7 +113,7 @@ class Args(Flags):
         if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
             how = INTEGRATION[self.task]
             values |= {"substeps": how.substeps, "implicit": how.implicit}
-        return super().task_defaults() | values | BALANCING.get(self.task, {})
+        return values
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -146,7 +139,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(start, requires_grad=not args.state_std)
 
     def forward(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Of normalized observations (K, B, obs_dim): the actions, and minus their log density per action (K, B)."""
+        """Return actions of normalized observations (K, B, obs_dim), and minus their log density per action (K, B)."""
         features = self.body(obs)
         log_std = self.log_std if self.spread is None else self.spread(features).clamp(*LOG_STD)
         u = self.mean(features) + log_std.exp() * noise
@@ -173,15 +166,42 @@ class Rollout(NamedTuple):
     done: Tensor  # terminated or truncated
 
 
+class Members(NamedTuple):
+    """K members share N environments, one after the other. Networks take tensors (K, B, ...) of B samples each."""
+
+    number: int  # K
+    num_envs: int  # N
+
+    def split(self, x: Tensor) -> Tensor:
+        """Give each member its environments: (N, ...) -> (K, N / K, ...)."""
+        return x.unflatten(0, (self.number, -1))
+
+    def join(self, x: Tensor) -> Tensor:
+        """Put environments one after the other again: (K, N / K, ...) -> (N, ...)."""
+        return x.flatten(0, 1)
+
+    def repeat(self, x: Tensor) -> Tensor:
+        """Give each environment its member's number: (K,) -> (N,)."""
+        return x.repeat_interleave(self.num_envs // self.number)
+
+    def samples(self, x: Tensor) -> Tensor:
+        """Give each member its samples of a rollout: (H, N, ...) -> (K, B, ...), where B is H N / K."""
+        return x.unflatten(1, (self.number, -1)).movedim(1, 0).flatten(1, 2)
+
+    def rollout(self, x: Tensor) -> Tensor:
+        """Put samples in the order of the rollout again: (..., K, B) -> (..., H, N)."""
+        return x.unflatten(-1, (-1, self.num_envs // self.number)).movedim(-3, -2).flatten(-2)
+
+
 class SAPO:
     """What an iteration changes, and the iteration.
 
-    K members learn side by side, each in its share of the environments, until the best one goes on in all of them. The
-    N environments are those of the members one after the other; networks take tensors (K, B, ...) of B samples each.
+    The members learn side by side, each in its share of the environments, until the best one goes on in all of them.
     """
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env, K = args, env, args.population
+        self.members = Members(K, env.num_envs)
         if env.num_envs % K:
             fail(f"--num-envs {args.num_envs} cannot be split evenly among --population {K}, in each process")
         if MINIBATCHES > (samples := args.horizon * env.num_envs // K):
@@ -191,7 +211,9 @@ class SAPO:
         critics = [mlp(env.task.obs_dim, *options, norm=True, orthogonal=True) for _ in range(args.critics * K)]
         self.critics = Ensemble(critics).to(env.device)
         if args.symmetric:
-            self.make_alike()
+            actor, layers = self.actor, self.critics.layers
+            size = actor.spread.layers if actor.spread else None
+            make_alike(env.task.mirror, actor, (actor.body.layers, layers), actor.mean.layers, layers, size)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.temperature = nn.ParameterDict({"log": torch.zeros(K)}).to(env.device)  # the entropy's weight
         score = {"reward": torch.zeros(K), "tied": torch.zeros(())}  # running mean reward; whether all members are one
@@ -202,17 +224,6 @@ class SAPO:
         self.temperature_optimizer = EnsembleAdam(self.temperature, 1, K, *limits)
         self.temperature_optimizer.lr.fill_(TEMPERATURE_LR)
         self.target_entropy = torch.zeros((), device=env.device)
-
-    def make_alike(self) -> None:
-        """Treat left and right alike: mirrored states get mirrored actions with the same noise, and the same value."""
-        mirror, actor = self.env.task.mirror, self.actor
-        mirror_statistics(actor.normalizer, mirror.obs)
-        for inputs in (actor.body, self.critics):
-            mirror_inputs(inputs.layers, mirror.obs)
-        outputs = [(actor.mean, mirror.action), (self.critics, mirror.value)]
-        for network, output in outputs + ([(actor.spread, mirror.size)] if actor.spread else []):
-            mirror_outputs(network.layers, output)
-        mirror_parameter(actor, "log_std", mirror.action)
 
     @property
     def optimizers(self) -> tuple[EnsembleAdam, ...]:
@@ -238,7 +249,7 @@ class SAPO:
             self.select(self.best)
 
     def select(self, member: int) -> None:
-        """From now on all members are this one, and learn from the samples of all."""
+        """Let all members be this one from now on, which learns from the samples of all."""
         for optimizer in self.optimizers:
             optimizer.tie(member)
         for p in self.targets.parameters():
@@ -251,24 +262,24 @@ class SAPO:
 
         It changes tensors in place and never waits for the device, so that on a GPU it becomes one CUDA graph.
         """
-        args, normalizer, K = self.args, self.actor.normalizer, self.args.population
+        args, normalizer, members = self.args, self.actor.normalizer, self.members
         temperature = self.temperature["log"].detach().exp()
 
         # Act for H steps in N environments. The entropy of the actions is part of the soft reward.
         rollout = self.collect()
         reward = rollout.reward
         if args.entropy:
-            weight = temperature.repeat_interleave(self.env.num_envs // K)
-            reward = reward + weight * (1 + rollout.entropy) / 2
+            reward = reward + members.repeat(temperature) * (1 + rollout.entropy) / 2
 
-        # The actor's step along the gradient through targets, rewards, simulator and actor. K: each member's mean loss.
+        # SHAC's Eq. 5 with the soft reward; the actor's step along its gradient through targets, rewards, simulator and
+        # actor. K times the mean over all environments is the sum of the members' losses.
         next_values = self.next_values(rollout)
         loss = actor_loss(reward, next_values.mean(0), rollout.done, GAMMA)
-        gradient = self.actor_optimizer.gradient(K * loss)
+        gradient = self.actor_optimizer.gradient(members.number * loss)
         norm = self.actor_optimizer.step(gradient)
 
         # The temperature rises where the entropy is below its target. No gradient of the rollout goes back from here.
-        entropy, gained = (self.split(x.detach()).mean(-1) for x in (rollout.entropy, rollout.reward))  # (K,)
+        entropy, gained = (members.samples(x.detach()).mean(-1) for x in (rollout.entropy, rollout.reward))  # (K,)
         surplus = (self.temperature["log"].exp() * (entropy - self.target_entropy)).sum()
         self.temperature_optimizer.step(self.temperature_optimizer.gradient(surplus))
         self.score["reward"].lerp_(self.actor_optimizer.average(gained), SCORE_RATE)
@@ -276,7 +287,7 @@ class SAPO:
         # Fit the critics to the soft TD(lambda) returns; the target critics follow.
         obs = rollout.obs.detach()
         value = td_lambda(reward.detach(), next_values.detach().amin(0), rollout.done, GAMMA, LAMBDA)
-        critic_loss = self.fit_critics(self.split(normalizer(obs)), self.split(value))
+        critic_loss = self.fit_critics(members.samples(normalizer(obs)), members.samples(value))
         normalizer.update(obs)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
@@ -295,11 +306,10 @@ class SAPO:
 
     def collect(self) -> Rollout:
         """Take H steps of all environments from where they stand, each with its member's policy."""
-        env, normalizer, members = self.env, self.actor.normalizer, (self.args.population, -1)
+        env, normalizer, members = self.env, self.actor.normalizer, self.members
         steps, obs = [], env.detach()  # no gradient goes back to the steps before
         for noise in torch.randn(self.args.horizon, env.num_envs, env.scene.nu, device=env.device).unbind():
-            own = self.actor(normalizer(obs).unflatten(0, members), noise.unflatten(0, members))
-            action, entropy = (tensor.flatten(0, 1) for tensor in own)
+            action, entropy = map(members.join, self.actor(members.split(normalizer(obs)), members.split(noise)))
             next_obs, reward, terminated, truncated, info = env.step(action)
             steps.append((obs, info["final_obs"], reward, entropy, terminated, terminated | truncated))
             obs = next_obs
@@ -317,23 +327,18 @@ class SAPO:
                 losses.append(errors.detach().mean())
         return torch.stack(losses).mean()
 
-    def split(self, tensor: Tensor) -> Tensor:
-        """Sort the samples of a rollout (H, N, ...) by members (K, B, ...)."""
-        return tensor.unflatten(1, (self.args.population, -1)).movedim(1, 0).flatten(1, 2)
-
     def values(self, critics: Ensemble, obs: Tensor) -> Tensor:
-        """Each critic's V (C, K, B) of normalized observations (K, B, obs_dim)."""
+        """Return each critic's V (C, K, B) of normalized observations (K, B, obs_dim)."""
         return critics(obs.repeat(self.args.critics, 1, 1)).squeeze(-1).unflatten(0, (self.args.critics, -1))
 
     def next_values(self, rollout: Rollout) -> Tensor:
-        """Each critic's V(s_{t+1}) (C, H, N): of an episode's last state where its time ran out, zero if terminated."""
-        values = self.values(self.targets, self.split(self.actor.normalizer(rollout.next_obs)))
-        values = values.unflatten(-1, (self.args.horizon, -1)).movedim(1, 2).flatten(2)
-        return values.masked_fill(rollout.terminated, 0.0)
+        """Return each critic's V(s_{t+1}) (C, H, N): of the last state where time ran out, zero where it terminated."""
+        values = self.values(self.targets, self.members.samples(self.actor.normalizer(rollout.next_obs)))
+        return self.members.rollout(values).masked_fill(rollout.terminated, 0.0)
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
+    """Compute SHAC's Eq. 5 of (H, N) steps: dones cut the rollouts, and the discount restarts after them."""
     ages, age = [], torch.zeros_like(reward[0])
     for ended in done:
         ages.append(age)
@@ -345,7 +350,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
+    """Compute TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns, following = torch.empty_like(reward), next_value[-1]
     for t in reversed(range(len(reward))):
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))

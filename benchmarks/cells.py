@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 import time
@@ -113,6 +114,7 @@ class Runner:
         command = [sys.executable, *torchrun, *stopping, str(tables.script_of(script)), *map(str, arguments)]
         command += ["--device", self.args.device]
         case.folder.mkdir(parents=True, exist_ok=True)
+        before = os.times()
         with (case.folder / "output.txt").open("a") as output:
             process = subprocess.Popen(command, stdout=output, stderr=output)
             try:
@@ -120,6 +122,10 @@ class Runner:
             except subprocess.TimeoutExpired:
                 process.terminate()
                 process.wait()
+        after = os.times()
+        spent = after.children_user + after.children_system - before.children_user - before.children_system
+        with (case.folder / "core_seconds.txt").open("a") as file:
+            file.write(f"{spent:.1f}\n")
         if process.returncode:
             print(f"{case.folder}: stopped or failed, see output.txt there", flush=True)
         return process.returncode == 0

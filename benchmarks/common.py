@@ -234,6 +234,32 @@ def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
     return rows
 
 
+# Learners' names and colours in tables and pictures. What is not here, such as a learner with other flags, has a colour
+# of OTHERS in its picture.
+NAMES = {
+    **{"rpo": "RPO", "shac": "SHAC", "sapo": "SAPO", "bptt": "BPTT", "mbpo": "MBPO", "se_mbpo": "SE-MBPO"},
+    **{"ppo_baseline": "PPO, default", "ppo_4096": "PPO, 4,096 environments"},
+    **{"sac_baseline": "SAC", "sac_large": "SAC, large batches", "redq": "REDQ", "redq_500": "REDQ, 500 iterations"},
+    **{"shac_8": "SHAC", "ppo_8": "PPO, 4,096 environments", "ppo_16": "PPO, 4,096 environments"},
+    **{f"shac_h{steps}": f"SHAC, rollouts of {steps} steps" for steps in (4, 8, 16, 64, 128)},
+    **{"shac_no_critic": "SHAC without critic", "pods": "PODS", "pods_second": "PODS, second order"},
+    **dict.fromkeys(("pfpn_ppo", "pfpn_sac"), "particles"),
+    **dict.fromkeys(("pfpn_gaussian_ppo", "pfpn_gaussian_sac"), "Gaussian"),
+}
+COLOURS = {
+    **{"rpo": "C0", "shac": "C1", "sapo": "C2", "ppo_baseline": "C3", "ppo_4096": "C3", "ppo_8": "C3", "ppo_16": "C3"},
+    **{"bptt": "C4", "sac_baseline": "C5", "sac_large": "C5", "redq": "C6", "redq_500": "C6", "mbpo": "C7"},
+    **{"se_mbpo": "C8", "pods": "C8", "pfpn_ppo": "C9", "pfpn_sac": "C9", "shac_8": "C1"},
+}
+OTHERS = "kbgmcy"
+
+
+def colours(learners: Sequence[str]) -> dict[str, str]:
+    """Give each learner of a picture its colour."""
+    others = [learner for learner in learners if learner not in COLOURS]
+    return COLOURS | dict(zip(others, OTHERS, strict=False))
+
+
 Numbers = Sequence[float] | np.ndarray
 
 
@@ -263,6 +289,22 @@ class Panel(NamedTuple):
     log: str = ""  # the logarithmic axes: x, y or xy
 
 
+def label_decades(axis: Any) -> None:
+    """Label a logarithmic axis with numbers that do not collide: few on one decade, 1, 2 and 5 on several."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+    decades = np.log10(np.divide(*axis.get_view_interval()[::-1]))
+    if decades < 1:
+        axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+    if decades < 3:
+        axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+    if 1 <= decades < 1.8:
+        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axis.set_minor_formatter("{x:g}")
+    axis.set_tick_params(which="both", labelsize=8)
+
+
 WIDE = 3  # panels in a row: their text can be read where a page shows 800 pixels
 
 
@@ -272,7 +314,6 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
         return
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import LogLocator
 
     width = min(WIDE, len(grid[0]))
     blocks = [row[k : k + width] for k in range(0, len(grid[0]), width) for row in grid]
@@ -289,10 +330,8 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
                 axis.annotate(note, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=8)
         axis.set(xlabel=panel.x, ylabel=panel.y)
         axis.set(xscale="log" if "x" in panel.log else "linear", yscale="log" if "y" in panel.log else "linear")
-        if "x" in panel.log and np.log10(np.divide(*axis.get_xlim()[::-1])) < 3:  # decades: room for more labels
-            axis.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-            axis.xaxis.set_major_formatter("{x:g}")
-            axis.xaxis.set_minor_formatter("{x:g}")
+        for name in panel.log if panel.lines else "":
+            label_decades(getattr(axis, f"{name}axis"))
         axis.set_title(panel.title, fontsize=10)
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)

@@ -23,11 +23,12 @@ import tyro
 from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import SceneError, Simulator, load_scene
-from diffsim.robot.contact import ground_pairs
+from diffsim.robot.contacts import ground_pairs
 from diffsim.robot.elements import control_range
 from diffsim.robot.pairs import touching
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
 from diffsim.robot.shapes import as_primitives
+from diffsim.robot.types import Array
 from diffsim.sim.integration import Integration
 from diffsim.training import fail
 from diffsim_cli.gait import trace

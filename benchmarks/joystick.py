@@ -146,13 +146,26 @@ def alone(rows: list[dict[str, str]]) -> list[dict[str, str]]:
     return [row for row in rows if "_shared/" not in row["checkpoint"]]
 
 
-def policies(rows: list[dict[str, str]]) -> dict[str, list[dict[str, str]]]:
-    """The rows of each task, learner and machine, by these; of other files than the task's, if there are any."""
-    rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
+Policy = tuple[str, str, str]  # task, learner and machine
+
+
+def policies(rows: list[dict[str, str]]) -> dict[Policy, list[dict[str, str]]]:
+    """The rows of each policy; of other files than the task's, if there are any."""
+    rows = [row | {"by": learner(row)} for row in rows]
     rows = [row | {"on": row["checkpoint"].partition("/")[0].removesuffix("_shared")} for row in rows]
     rows.sort(key=lambda row: (row["task"], row["by"], row["on"]))
     rows = [row for row in rows if row["file"]] or rows
-    return {", ".join(key): group for key, group in grouped(rows, "task", "by", "on").items()}
+    return {(key[0], key[1], key[2]): group for key, group in grouped(rows, "task", "by", "on").items()}
+
+
+def learner(row: dict[str, str]) -> str:
+    """Shorten a checkpoint's learner: "ppo_baseline --symmetric" is PPO."""
+    return row["learner"].partition(" ")[0].removesuffix("_baseline").upper()
+
+
+def about(policy: Policy) -> dict[str, str]:
+    task, by, on = policy
+    return {"robot": task, "learner": by, "machine": {"cpu": "CPU"}.get(on, on.upper() if on[0] == "h" else on)}
 
 
 def with_worst(rows: list[dict[str, str]], column: str, form: str, worst: Callable[[Sequence[float]], float]) -> str:
@@ -170,17 +183,24 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     lines = list[Row]()
     for policy, group in policies(rows).items():
         plain = undisturbed(group)
-        line = {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
-        line |= {"training (s)": middle(alone(plain), "training s", ".0f")}
+        *first, machine = about(policy).items()
+        line: dict[str, object] = {**dict(first), "seeds": len({row["checkpoint"] for row in group})}
+        line |= {"training (s)": timed(plain, machine[1])}
         errors = {"error (m/s)": "error", "worst command (m/s)": "worst error", "yaw rate (rad/s)": "yaw error"}
         lines.append(line | {title: with_worst(plain, column, ".3f", max) for title, column in errors.items()})
     return lines
 
 
+def timed(rows: list[dict[str, str]], machine: str) -> str:
+    """The seconds of trainings that had the machine for themselves, and which it was."""
+    seconds = middle(alone(rows), "training s", ".0f")
+    return f"{seconds}, {machine}" if seconds else ""
+
+
 def whole(rows: list[dict[str, str]]) -> list[Row]:
     """The share of episodes without a fall: a line for each task, learner and machine, a column for worlds that agree
     in all of them."""
-    lines: dict[str, dict[str, str]] = {}
+    lines: dict[str, dict[Policy, str]] = {}
     for policy, group in policies(rows).items():
         kinds: dict[str, list[dict[str, str]]] = {}
         for row in group:
@@ -192,16 +212,21 @@ def whole(rows: list[dict[str, str]]) -> list[Row]:
     for kind in sorted(lines, key=lambda kind: [not kind.startswith(name) for name in order]):
         agreeing.setdefault(tuple(lines[kind].get(policy, "") for policy in policies(rows)), []).append(kind)
     return [
-        {"policy": policy} | {", ".join(kinds): cells[k] for cells, kinds in agreeing.items()}
+        about(policy) | {titled(kinds): cells[k] for cells, kinds in agreeing.items()}
         for k, policy in enumerate(policies(rows))
     ]
+
+
+def titled(kinds: list[str]) -> str:
+    """A column's title; the page lists the worlds if they are many."""
+    return ", ".join(kinds) if len(kinds) < 4 else f"{len(kinds)} mild worlds"
 
 
 def race(rows: list[dict[str, str]]) -> list[Row]:
     """Seconds of training to an error, from checkpoints along the way: a line for each task and learner, with all
     seeds."""
     lines = list[Row]()
-    for (task, learner), seeds in grouped(rows, "task", "learner").items():
+    for (task, _), seeds in grouped(rows, "task", "learner").items():
         columns = dict[str, list[str]]()
         for group in grouped(seeds, "seed").values():
             group.sort(key=lambda row: float(row["training s"]))
@@ -211,13 +236,13 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
             columns.setdefault("in all (s)", []).append(group[-1]["training s"])
             columns.setdefault("last error (m/s)", []).append(group[-1]["error"])
         line = {name: ", ".join(cells) for name, cells in columns.items()}
-        lines.append({"task": task, "learner": learner.partition(" ")[0]} | line)
+        lines.append({"task": task, "learner": learner(seeds[0])} | line)
     return lines
 
 
 def rough(rows: list[dict[str, str]]) -> list[Row]:
     """Who is whole on the steepest ground, and errors on each. A column for each task, learner and trained slope."""
-    rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
+    rows = [row | {"by": learner(row)} for row in rows]
     rows = [row | {"on": f"{row['learner'].partition(' rough ')[2] or 0}°"} for row in rows]
     columns = {", ".join(key): group for key, group in sorted(grouped(rows, "task", "by", "on").items())}
     slopes, lines = sorted({row["rough"] for row in rows}, key=float), list[Row]()

@@ -34,8 +34,8 @@ from diffsim_cli.tune.motion import SPANS, Motion
 PartName = Literal["presets", "extremes", "promise"]
 ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again
 PROMISED = ("robot", "chosen", "error", "error on 200 others", "speed", "default's error")
-SHOWN = ("speed", "state 0.5 s", "gradient 32")
-PRESETS = ("task", "fast", "default")  # of a table: accurate has four times the substeps of default
+SHOWN = {"speed": "speed", "state error (m, rad)": "state 0.5 s", "gradient error": "gradient 32"}
+PRESETS = ("fast", "default")  # of a table: accurate has four times the substeps of default
 
 
 @dataclass
@@ -93,11 +93,12 @@ def presets(rows: list[Cells]) -> list[Cells]:
 
 
 def shown(rows: list[Cells]) -> list[Row]:
-    """A line for each task: of each preset the setting, then the speed and the errors of the state and the gradient."""
+    """A line for each task and preset: its integrator and substeps, the speed, and the errors of state and gradient."""
     lines = list[Row]()
-    for (task,), own in grouped(presets(rows), "task").items():
-        told = {row["preset"]: ", ".join(row[name] for name in SHOWN) for row in own}
-        lines.append({"task": task} | {row["preset"]: f"{row['setting']}<br>{told[row['preset']]}" for row in own})
+    for row in (row for row in presets(rows) if row["preset"] in PRESETS):
+        how, _, substeps = row["setting"].rpartition(", ")
+        line = {"task": row["task"], "preset": row["preset"], "integrator": how, "substeps": substeps}
+        lines.append(line | {title: row[name] for title, name in SHOWN.items()})
     return lines
 
 
@@ -144,13 +145,13 @@ def draw(args: Args, rows: list[Cells]) -> None:
             same = sorted(same, key=lambda row: float(row["us with gradient"]))
             x, y = ([float(row[name]) for row in same] for name in ("us with gradient", "state 0.5 s"))
             lines.append(Line(x, y, f"C{k}.-", kind, 0.8, [row["preset"] for row in same]))
-        panels.append(Panel(lines, task, "us of a control step", "error of the state after 0.5 s", log="xy"))
+        panels.append(Panel(lines, task, "us of a control step", "state error after 0.5 s (m, rad)", log="xy"))
     plot(args.picture("numerics"), [panels], (3.2, 2.8))
 
 
 PAGE = "numerics.md"
 PARTS: dict[PartName, Part] = {
-    "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, shown, PRESETS),
+    "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, shown),
     "extremes": Part("numerics_extremes", measure_extremes, ("task", "sweep"), "extremes", shown=bounds),
     "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", columns=PROMISED),
 }

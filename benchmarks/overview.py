@@ -11,25 +11,26 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from statistics import median
 
 import cells
 import common
 import numpy as np
 import paper
 from cells import RETURNS, Curve
-from common import LEARNT, Line, Panel, plot, run
-from tables import Row, grouped, markdown, read_csv
+from common import COLOURS, LEARNT, NAMES, Line, Panel, plot, run
+from tables import Row, grouped, markdown, numbers, ranged, read_csv
 
 PAGE, README = "benchmarks.md", "../README.md"
 GPUS = "h200", "h100"  # of a learner with results on both the first one counts
-# Ablations of a learner have their pages. Each learner keeps its colour.
+# Ablations of a learner have their pages.
 SHOWN = "rpo shac sapo ppo_4096 ppo_baseline bptt sac_baseline sac_large redq redq_500 mbpo se_mbpo".split()
-COLUMNS = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")
-MAIN = {"rpo": "RPO", "shac": "SHAC", "ppo_4096": "PPO"}  # in the README
+SAME_STEPS = {"ant": ("rpo", "shac_8", "ppo_8"), "humanoid": ("rpo", "ppo_16")}  # in the README: groups steps_...
+TUNED = "entropy bonus 0.01"  # of PPO's trials: the default of these tasks
 RACES = (
-    ("joystick_race", "error", "go2", "error (m/s)"),
-    ("joystick_race", "error", "g1", "error (m/s)"),
-    ("tracking_race", "success", "g1_track", "success"),
+    ("joystick_race", "error", "go2", "velocity error (m/s)"),
+    ("joystick_race", "error", "g1", "velocity error (m/s)"),
+    ("tracking_race", "success", "g1_track", "share of successes"),
 )
 
 
@@ -46,46 +47,72 @@ def lines(machine: str) -> dict[tuple[str, str], Row]:
         seeds = own.get((task, learner), [])
         if len(seeds) > 2 and len({row["trained on"] for row in seeds}) == 1:
             total = next((row["in all (s)"] for row in seeds if row["seed"] == "1"), "")
-            shown: Row = {**paper.line(seeds), "in all (s)": f"{float(total):.0f}" if total else ""}
-            found[task, learner] = {**shown, "training (s)": paper.seconds(shown)}
+            shown: Row = {**paper.line(seeds), "seed 1 in all (s)": f"{float(total):.0f}" if total else ""}
+            name = (
+                f"{NAMES[learner]}{cpu(seeds[0]['trained on']) if machine == 'cpu' and shown['training (s)'] else ''}"
+            )
+            found[task, learner] = {**shown, "learner": name}
     return found
 
 
-def gpu() -> dict[tuple[str, str], Row]:
-    """Of the first GPU that has a learner on a task; another's name is in the learner's."""
+def cpu(trained_on: str) -> str:
+    """Name the CPU in brackets: "2 of 16 cores of Intel(R) Xeon(R) Processor" is (Xeon, 2 of 16)."""
+    share, _, kind = trained_on.partition(" cores of ")
+    return f" ({'EPYC' if 'EPYC' in kind else 'Xeon'}{f', {share}' if 'of' in share else ''})"
+
+
+def gpu() -> list[Row]:
+    """Rows of the first GPU that has a learner on a task; another's name is in the learner's. PPO's tuned rows last."""
     found = dict[tuple[str, str], Row]()
     for machine in reversed(GPUS):
         mark = "" if machine == GPUS[0] else f" ({machine})"
         found |= {key: {**row, "learner": f"{row['learner']}{mark}"} for key, row in lines(machine).items()}
-    return {key: found[key] for key in product(LEARNT, SHOWN) if key in found}
-
-
-def compared(found: dict[tuple[str, str], Row]) -> Iterator[Row]:
-    """README's table: of each main learner the return, the seconds and the control steps to the target."""
-    there = [learner for learner in MAIN if any(key[1] == learner for key in found)]
+    rows = list[Row]()
     for task in LEARNT:
-        own = {learner: found[task, learner] for learner in there if (task, learner) in found}
-        if len(own) > 1:
-            line: dict[str, object] = {"task": task}
-            for learner, row in own.items():
-                times = row["s to target"], row["steps to target"]
-                reached = "not" if "never" in times else f"{times[0]} s, {times[1]}"
-                mark = str(row["learner"]).removeprefix(learner).upper()
-                line[MAIN[learner] + mark] = f"{float(str(row['return']).split()[0]):,.0f}<br>{reached}"
-            yield line
+        rows += [found[task, learner] for learner in SHOWN if (task, learner) in found]
+        rows += [{"task": task, "learner": "PPO, tuned", "return": tuned}] if (tuned := returns_of_tuned(task)) else []
+    return rows
 
 
-def median_curve(runs: Sequence[Curve], style: str, label: str) -> Line:
-    """Against seconds, where all runs have some."""
-    begin, end = max(each["seconds"][0] for each in runs), min(each["seconds"][-1] for each in runs)
-    shared = np.geomspace(begin, end, 300)
-    returns = [np.interp(shared, each["seconds"], each["return"]) for each in runs]
-    return Line(shared, np.median(returns, axis=0), style, label)
+def returns_of_tuned(task: str, form: str = ".0f") -> str:
+    """Those of PPO's trials with the entropy bonus that became a task's default."""
+    rows = read_csv(common.RESULTS / "h100" / "ppo_trials.csv")
+    rows = [row for row in rows if (row["group"], row["cell"]) == (f"{task}, 157 M", TUNED)]
+    return ranged(numbers(rows, "return"), form)
+
+
+def compared() -> Iterator[Row]:
+    """README's table, of one H200: learners with the same steps of the simulation, over seeds."""
+    rows = [row for row in cells.read_cells(common.RESULTS / GPUS[0]) if cells.counts(row, timed=True)]
+    for task, learners in SAME_STEPS.items():
+        target = RETURNS[task].target
+        for learner in learners:
+            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
+            steps = median(numbers(own, f"control_steps to {target}")) / 1e6
+            yield {
+                "task": task,
+                "learner": {"rpo": "RPO (our variant)"}.get(learner, learner.partition("_")[0].upper()),
+                "final return": ranged(numbers(own, "return"), ",.0f"),
+                f"M steps to {target:,}": f"{steps:.2g}",
+                f"s to {target:,}": ranged(numbers(own, f"seconds to {target}"), ".0f"),
+                "whole training (s)": ranged(numbers(own, "training (s)"), ".0f"),
+                "from the command (s)": ranged(numbers(own, "in all (s)"), ".0f"),
+            }
+        if tuned := returns_of_tuned(task, ",.0f"):
+            yield {"task": task, "learner": "PPO, tuned", "final return": tuned}
+
+
+def curves_of(learner: str, runs: Sequence[Curve]) -> list[Line]:
+    """Draw each seed from its own start (thin), and the median."""
+    style = f"{COLOURS[learner]}-"
+    end = max(float(each["seconds"][-1]) for each in runs)
+    seeds = [Line(each["seconds"], each["return"], style, width=0.4) for each in runs]
+    return [*seeds, Line(*paper.median_curve(runs, "seconds", end), style, NAMES[learner], 1.8)]
 
 
 def panels(machines: Sequence[str]) -> list[Panel]:
     """One for each task: a line for each learner that has its seconds."""
-    drawn = dict[tuple[str, str], Line]()
+    drawn = dict[tuple[str, str], list[Line]]()
     for machine in machines:
         known = cells.paces(common.RESULTS / machine)
         rows = [row for row in read_csv(common.RESULTS / machine / "curves.csv") if row["learner"] in SHOWN]
@@ -97,15 +124,11 @@ def panels(machines: Sequence[str]) -> list[Panel]:
                     row["seconds"] = str(pace(float(row["iteration"])))
             runs = [cells.curve(seed) for seed in grouped(own, "seed").values()]
             if len(runs) > 2 and not any(np.isnan(each["seconds"]).any() for each in runs):
-                colour = SHOWN.index(learner) % 10
-                drawn[learner, task] = median_curve(
-                    runs, f"C{colour}{'-' if SHOWN.index(learner) < 10 else '--'}", learner
-                )
+                drawn[learner, task] = curves_of(learner, runs)
     tasks = [task for task in LEARNT if any(key[1] == task for key in drawn)]
-    return [
-        Panel([line for (_, each), line in drawn.items() if each == task], task, "seconds of training", "return", "x")
-        for task in tasks
-    ]
+    y = "return of training episodes"
+    found = {task: [line for (_, each), own in drawn.items() if each == task for line in own] for task in tasks}
+    return [Panel(own, task, "seconds of training", y, "x") for task, own in found.items()]
 
 
 def races() -> Iterator[Panel]:
@@ -117,15 +140,14 @@ def races() -> Iterator[Panel]:
             own.sort(key=lambda row: float(row["training s"]))
             script = "ppo_4096" if learner.startswith("ppo") else learner.partition(" ")[0]
             x, values = ([float(row[name]) for row in own] for name in ("training s", column))
-            drawn.append(Line(x, values, f"C{SHOWN.index(script)}-", script, 1.0))
+            drawn.append(Line(x, values, f"{COLOURS[script]}-", NAMES[script], 1.0))
         yield Panel(drawn, task, "seconds of training", y, "xy" if column == "error" else "x")
 
 
 def main(args: Args) -> None:
-    on_gpu = gpu()
-    args.publish("why", markdown([*compared(on_gpu)]), README)
-    args.publish("gpu", markdown([*on_gpu.values()], COLUMNS), PAGE)
-    args.publish("cpu", markdown([*lines("cpu").values()], COLUMNS), PAGE)
+    args.publish("why", markdown([*compared()]), README)
+    args.publish("gpu", paper.by_task(gpu()), PAGE)
+    args.publish("cpu", paper.by_task([*lines("cpu").values()]), PAGE)
     grid = [*panels(GPUS), *races()]
     plot(args.picture("benchmarks"), [grid], (3.4, 2.6))
     plot(args.picture("benchmarks_cpu"), [panels(("cpu",))], (3.4, 2.6))

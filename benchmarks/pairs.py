@@ -38,8 +38,8 @@ from diffsim.kernels.pairs.rows import ACCURACY
 from diffsim.kernels.pairs.solver import ROUND_OFF
 from diffsim.robot.elements import control_range
 from diffsim.robot.pairs import with_pairs
-from diffsim.robot.scene import Array
 from diffsim.robot.shapes import as_primitives
+from diffsim.robot.types import Array
 from diffsim.sim import simulator
 from diffsim.training import Count, fail
 

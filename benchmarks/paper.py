@@ -17,7 +17,6 @@ side (--shared): their seconds are then those of pace.csv, of iterations that ha
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,15 +28,16 @@ import common
 import fingerprints
 import numpy as np
 from cells import GROUPS, LEARNERS, RETURNS, Cell, Curve, Group, Runner, ScriptFlags, curve, evaluation, read_cells
-from common import LEARNT, Line, Panel, Tasks, check_names, plot, run
-from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, read_csv
+from common import LEARNT, NAMES, Line, Panel, Tasks, check_names, colours, plot, run
+from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, ranged, read_csv, tell
 
 import diffsim
 from diffsim.training import Natural, checkpoint
 
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
-TIMED = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")  # that a page shows
+# Columns of a task's table on a page.
+TIMED = ("learner", "return", "training (s)", "seed 1 in all (s)", "s to target", "M steps to target", "falls")
 
 
 @dataclass
@@ -148,23 +148,30 @@ def curves(args: Args, name: str) -> dict[tuple[str, str], list[Curve]]:
 def panel(group: Group, found: Mapping[tuple[str, str], list[Curve]], task: str, x: str) -> Panel:
     """Each seed (thin) and the median (bold) against control steps or seconds, on a log axis if ends lie far apart."""
     lines, begins, ends = list[Line](), list[float](), list[float]()
-    for k, learner in enumerate(group.learners):
+    colour = colours(group.learners)
+    for learner in group.learners:
         runs = [run for run in found.get((learner, task), []) if not np.isnan(run[x]).any()]
         if not runs:  # or none that had its machine alone, and has seconds
             continue
-        begins.append(max(run[x][0] for run in runs))
+        begins.append(min(run[x][0] for run in runs))
         ends.append(min(run[x][-1] for run in runs))
-        shared = np.geomspace(begins[-1], ends[-1], 400)
-        middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
-        lines += [Line(run[x], run["return"], f"C{k}-", width=0.5) for run in runs]
-        lines.append(Line(shared, middle, f"C{k}-", learner, width=2))
+        shared, middle = median_curve(runs, x, ends[-1])
+        lines += [Line(run[x], run["return"], f"{colour[learner]}-", width=0.5) for run in runs]
+        lines.append(Line(shared, middle, f"{colour[learner]}-", NAMES.get(learner, learner), width=2))
     for learner, value in RETURNS[task].published.items():
         if ends and learner in group.learners:
-            style = f"C{group.learners.index(learner)}--"
-            lines.append(Line((min(begins), max(ends)), [value] * 2, style, f"{learner}, published", 0.8))
+            style, name = f"{colour[learner]}--", f"{NAMES[learner]}, published"
+            lines.append(Line((min(begins), max(ends)), [value] * 2, style, name, 0.8))
     log = "x" if ends and max(ends) > 10 * min(ends) else ""
     text = {"control_steps": "control steps", "seconds": "seconds of training"}[x]
     return Panel(lines, task, text, "return of training episodes" if task == group.tasks[0] else "", log)
+
+
+def median_curve(runs: Sequence[Curve], x: str, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places on x and the median there. A seed that has not begun counts as the lowest."""
+    shared = np.geomspace(min(run[x][0] for run in runs), end, 400)
+    values = np.median([np.interp(shared, run[x], run["return"], left=-np.inf) for run in runs], axis=0)
+    return shared[begun := np.isfinite(values)], values[begun]
 
 
 def pictured(args: Args, name: str) -> None:
@@ -188,27 +195,36 @@ def ratios(args: Args, name: str) -> list[Row]:
             end = min(run["control_steps"][-1] for runs in both for run in runs)
             best = [[float(np.nanmax(run["return"][run["control_steps"] <= end])) for run in runs] for runs in both]
             row: dict[str, object] = {"task": task, "control steps": f"{end / 1e6:.3g} M"}
-            row |= {learner: cells.spread(values) for learner, values in zip((first, second), best, strict=True)}
+            names = (NAMES.get(learner, learner) for learner in (first, second))
+            row |= {name: cells.spread(values) for name, values in zip(names, best, strict=True)}
             rows.append(row | {"ratio": f"{mean(best[0]) / mean(best[1]):.2f}"})
     return rows
 
 
 def line(rows: Sequence[Cells]) -> Row:
-    """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
+    """Show all seeds of a learner on a task: medians, of the return and of the seconds to the target also the range, of
+    the falls the most. Seconds that were computed from an iteration's have a mark."""
     returns, task = numbers(rows, "return"), rows[0]["task"]
     shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"]}
-    shown["return"] = f"{median(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
-    shown["training (s)"] = middle(rows, "training (s)", ".0f")
+    shown["return"] = ranged(returns, ".0f")
+    shown["training (s)"] = middle(rows, "training (s)", ".0f") + max(row.get("paced", "") for row in rows)
     shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}"}
     target = RETURNS[task].target
-    time, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
-    shown |= {"paced": max(row.get("paced", "") for row in rows)}
-    shown |= {"s to target": "" if math.isnan(time) else tell(time, ".0f")}
-    return shown | {"steps to target": tell(steps / 1e6, ".3g") + " M" * (steps < math.inf)}
+    shown["s to target"] = ranged(numbers(rows, f"seconds to {target}"), ".0f")
+    steps = numbers(rows, f"control_steps to {target}")
+    return shown | {"M steps to target": tell(median(steps) / 1e6, ".3g") if steps else ""}
 
 
-def tell(value: float, form: str) -> str:
-    return "never" if value == math.inf else f"{value:{form}}"
+def by_task(rows: Sequence[Row]) -> str:
+    """A table for each task that has several learners, under its name and target; a single one compares nothing."""
+    text = list[str]()
+    for task, count in Counter(row["task"] for row in rows).items():
+        own = [
+            {**row, "learner": NAMES.get(str(row["learner"]), row["learner"])} for row in rows if row["task"] == task
+        ]
+        if count > 1:
+            text.append(f"**{task}**, target {RETURNS[str(task)].target:,}\n\n{markdown(own, TIMED)}")
+    return "\n".join(text) or "(none yet)\n"
 
 
 def table(args: Args, name: str) -> list[Row]:
@@ -221,7 +237,7 @@ def table(args: Args, name: str) -> list[Row]:
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
             own = [row for row in own if int(row["seed"]) <= seeds and cells.counts(row, group.timed)]
             if len(own) == seeds and len({row["trained on"] for row in own}) == 1:
-                lines.append({**line(own), "in all (s)": total.get((learner, task), "")})
+                lines.append({**line(own), "seed 1 in all (s)": total.get((learner, task), "")})
     return lines
 
 
@@ -232,21 +248,9 @@ def totals(args: Args, group: Group) -> dict[tuple[str, str], str]:
     return {(row["learner"], row["task"]): f"{float(row['in all (s)']):.0f}" for row in rows}
 
 
-def seconds(row: Row) -> str:
-    """Of the training, marked if computed from the time of an iteration, and in all, from the command to its end."""
-    return f"{row['training (s)']}{row['paced']}" + (f" ({row['in all (s)']})" if row["in all (s)"] else "")
-
-
 def printed(args: Args, name: str) -> str:
-    """A group's table: a line for each learner and task, or for each task the ratio of two learners.
-
-    A task that has a single learner is left out: it compares nothing.
-    """
-    if GROUPS[name].ratios:
-        return markdown(ratios(args, name))
-    rows = table(args, name)
-    count = Counter(row["task"] for row in rows)
-    return markdown([{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1], TIMED)
+    """A group's tables: a line for each learner, or for each task the ratio of two learners."""
+    return markdown(ratios(args, name)) if GROUPS[name].ratios else by_task(table(args, name))
 
 
 def check(args: Args) -> str:

@@ -31,7 +31,6 @@ from worlds import FASTEST, MuJoCo, mujoco_model
 
 import diffsim
 import ppo_baseline
-from diffsim.tasks import find_task
 from diffsim.training import Count, Positive, Run, fail, graph, parse
 
 PartName = Literal["speed", "train"]
@@ -143,7 +142,7 @@ def train(args: Args, name: Name) -> Iterator[Row]:
     flags = f"--env {name}:randomise=none --seed {args.seed} --device {args.device} --contact mujoco {PPO}".split()
     folder = f"{args.runs}/ppo_mujoco_warp/{name}__{args.seed}"
     settings = parse(ppo_baseline.Args, [*flags, "--run-dir", folder, *args.arguments])
-    if settings.contact != "mujoco" or find_task(settings.env).varied_by:
+    if settings.contact != "mujoco" or settings.task_class.varied_by:
         fail(
             "mujoco_warp has its own contact, which does not vary: leave out --contact and ranges after the task's name"
         )
@@ -159,9 +158,9 @@ def train(args: Args, name: Name) -> Iterator[Row]:
         for kept, part in zip(samples, ppo.act()[0], strict=True):
             kept.copy_(part)
         training.log(learn() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
-        if training.seconds >= args.seconds:
+        if training.recorder.seconds >= args.seconds:
             training.last = settings.iterations = iteration
-    last = read_csv(training.directory / "progress.csv")[-1]
+    last = read_csv(training.directory.path / "progress.csv")[-1]
     shown = {"control steps": "control_steps", "training (s)": "seconds", "control steps/s": "charts_SPS"}
     shown |= {"return": "return", "lost": "sim_lost"}
     row: Row = {"task": name, "seed": args.seed, "iteration": int(last["iteration"])}

@@ -20,9 +20,10 @@ import tyro
 from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import Simulator
-from diffsim.robot.contact import contact_points
+from diffsim.robot.contacts import contact_points
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.training import Count

@@ -295,7 +295,7 @@ def shown_iterations(rows: Sequence[Mapping[str, str]]) -> list[Row]:
 
 def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     """Microseconds of one differentiated control step of one environment, against environments and horizon."""
-    panels, unit, speed = list[Panel](), "us per control step, forward + backward", "differentiated control steps/s"
+    panels, unit, speed = list[Panel](), "us per control step, both ways", "differentiated control steps/s"
     for x, fixed, value in (("environments", "horizon", "32"), ("horizon", "environments", "64")):
         own = [row for row in rows if row[fixed] == value]
         points = [{x: r[x], unit: str(1e6 / float(r[speed])), "curve": f"{r['task']}, {r['technique']}"} for r in own]

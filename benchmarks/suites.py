@@ -30,12 +30,10 @@ READ: dict[str, Callable[[Sequence[float]], float]] = {
     "middle": median,
     "most": max,
     "sum": sum,
-    "count": len,
 }
 SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "mean": lambda values: f"{mean(values):.0f}",
     "thousandths": lambda values: f"{1e3 * mean(values):.0f}",
-    "tenth": lambda values: f"{mean(values):.1f}",
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",
     "percent": lambda values: f"{mean(values):.1%}",
@@ -91,19 +89,31 @@ def line(suite: Suite, folder: Path) -> dict[str, object]:
     rows = read_csv(folder / "progress.csv")
     if not any(numbers(rows, column) for column in ("eval_return", "eval_objective")):
         return {}
-    args, found = json.loads((folder / "args.json").read_text()), dict[str, object]()
+    found = dict[str, object]()
     for name, (how, column) in suite.columns.items():
         values = numbers(rows, column)
-        if how in ("args", "gait"):
-            values = [args[column] if how == "args" else float(feet(folder))]
+        if how in OTHERS:
+            values = [OTHERS[how](folder, column)]
         found[name] = f"{READ.get(how, mean)(values):.6g}" if values else ""
     return found
+
+
+def core_seconds(folder: Path) -> float:
+    """Seconds of CPU time that a run took so far, of all its calls."""
+    return sum(map(float, (folder / "core_seconds.txt").read_text().split()))
 
 
 def feet(folder: Path) -> int:
     """On how many feet a run's policy moves: their duty factors are at least half of the largest."""
     duty = [float(row["value"]) for row in read_csv(folder / "gait.csv") if row["number"] == "duty"]
     return sum(value >= max(duty) / 2 for value in duty)
+
+
+OTHERS: dict[str, Callable[[Path, str], float]] = {
+    "args": lambda folder, name: float(json.loads((folder / "args.json").read_text())[name]),
+    "core": lambda folder, _: core_seconds(folder),
+    "gait": lambda folder, _: feet(folder),
+}
 
 
 def table(suite: Suite, rows: Sequence[Cells]) -> list[Row]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import math
 import os
 import platform
 import re
@@ -141,3 +142,15 @@ def middle(rows: Sequence[Cells], column: str, form: str) -> str:
     """The median of a column's numbers, or nothing."""
     values = numbers(rows, column)
     return format(median(values), form) if values else ""
+
+
+def ranged(values: Sequence[float], form: str) -> str:
+    """The median, in brackets the least and the most if they differ; nothing of no values."""
+    if not values:
+        return ""
+    middle, *ends = (tell(value, form) for value in (median(values), min(values), max(values)))
+    return middle if ends[0] == ends[1] else f"{middle} ({ends[0]} to {ends[1]})"
+
+
+def tell(value: float, form: str) -> str:
+    return "never" if value == math.inf else f"{value:{form}}"

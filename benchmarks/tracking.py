@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from common import ABOUT, Part, load_case, measured, run
 from joystick import alone, training
-from tables import Row, grouped, markdown, middle, numbers
+from tables import Row, grouped, markdown, middle, numbers, ranged
 from worlds import Array, OtherFile, State, pushes, rollout
 
 from diffsim.training import Count, SavedPolicy, fail
@@ -56,14 +56,13 @@ def track(saved: SavedPolicy, task: Tracking, world: OtherFile, args: Args) -> t
 
     push = pushes(args.push, task.control_dt, drawn)
     start = State(qpos, qvel, torch.zeros(n, task.joints).double(), memory)
-    names, sizes = zip(*task.obs_parts, strict=True)
     sums, counted, alive = torch.zeros(3, n).double(), torch.zeros(n), torch.ones(n, dtype=torch.bool)
     for step, seen in enumerate(rollout(world, task, saved.network, start, int(length.max()), push)):
         playing = step < length
         alive &= ~seen.fallen | ~playing
         if not (alive & playing).any():
             break
-        obs = dict(zip(names, seen.obs.split(sizes, -1), strict=True))
+        obs = task.named(seen.obs)
         off = *(obs[name].norm(dim=-1) for name in ("root_off", "root_turned")), obs["joints_off"].abs().mean(-1)
         sums += torch.where(alive & playing, torch.stack(off), 0.0)
         counted += alive & playing
@@ -102,45 +101,59 @@ def least(rows: list[dict[str, str]]) -> str:
     return f"{min(found):.0%}" if (found := numbers(rows, "success")) else ""
 
 
-def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str]], list[dict[str, str]]]]:
-    """A policy's name for each clip, learner (if not sapo) and device (if not a GPU), over seeds; its rows, and those
-    with the file's friction and no push."""
-    for (clip, learner, device), group in grouped(rows, "clip", "learner", "device").items():
+def groups(rows: list[dict[str, str]]) -> Iterator[tuple[dict[str, str], list[dict[str, str]], list[dict[str, str]]]]:
+    """A policy's clip, learner and, of one core, the machine, over seeds; its rows, and those with the file's friction
+    and no push."""
+    for (clip, learner, device), group in sorted(grouped(rows, "clip", "learner", "device").items()):
         name, drawn, _ = learner.partition(" randomised")
-        policy = ", ".join((clip, *(() if name == "sapo" else (name,)), *(() if device == "cuda" else (device,))))
+        by = name.upper() + (", one core" if device == "cpu" else "") + ("" if drawn else ", not randomised")
         plain = [row for row in group if float(row["friction"]) == 1 and float(row["push"]) == 0]
-        yield policy + ("" if drawn else ", not randomised"), group, plain
+        yield {"clip": clip, "learner": by}, group, plain
+
+
+def seeds(group: list[dict[str, str]]) -> int:
+    return len({row["checkpoint"] for row in group})
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each policy of one motion: medians over seeds on the file's friction. In brackets and of pushes the
-    least share over seeds and frictions."""
+    """A line for each policy of one motion: how many episodes succeed. Pushes and other frictions are told one by one,
+    so that all policies are compared in the same worlds."""
     lines = list[Row]()
     for policy, group, plain in groups([row for row in rows if row["motions"] == "1"]):
-        calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
+        calm = [row for row in group if float(row["push"]) == 0 and float(row["friction"]) != 1]
+        pushed = [row for row in group if float(row["push"]) > 0 and float(row["friction"]) == 1]
         lines.append(
-            {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
+            {**policy, "seeds": seeds(group)}
             | {"training (s)": timed(alone(plain))}
-            | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
-            | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
+            | {"success (worst seed)": f"{middle(plain, 'success', '.0%')} ({least(plain)})"}
+            | {"friction x 0.7, 1.3 (worst)": least(calm), "pushed (worst seed)": least(pushed)}
         )
     return lines
 
 
+def errors(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each policy of one motion: medians over seeds on the file's friction."""
+    return [
+        {**policy, "joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
+        for policy, _, plain in groups([row for row in rows if row["motions"] == "1"])
+    ]
+
+
 def timed(rows: list[dict[str, str]]) -> str:
-    """Seconds of the seeds that had a GPU for themselves, and their success."""
-    return f"{middle(rows, 'training s', '.0f')} ({middle(rows, 'success', '.0%')})" if rows else ""
+    """Seconds of the seeds that had a machine for themselves, and which one."""
+    machines = sorted({row["checkpoint"].partition("/")[0].upper() for row in rows})
+    return f"{ranged(numbers(rows, 'training s'), '.0f')}, {' and '.join(machines)}" if rows else ""
 
 
 def many(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each policy of several motions and what it was judged by, on the file's friction without pushes."""
     return [
-        {"policy": policy, "motions": row["motions"], "success": f"{float(row['success']):.0%}"}
+        {**policy, "motions": row["motions"], "success": f"{float(row['success']):.0%}"}
         | {
             f"motions with {ENOUGH:.0%}": row["whole motions"],
-            "training (s)": middle(alone([row]), "training s", ".0f"),
+            "training (s)": timed(alone([row])),
         }
-        | {"joints (rad)": row["joint error"], "root (m)": row["root error"]}
+        | {"joints (rad)": f"{float(row['joint error']):.3f}"}
         for policy, _, plain in groups([row for row in rows if row["motions"] != "1"])
         for row in plain
     ]
@@ -155,7 +168,7 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
         group.sort(key=lambda row: int(row["iteration"]))
         enough = [row for row in group if float(row["success"]) >= ENOUGH]
         twice = [row for row, after in pairwise(group) if row in enough and after in enough]
-        line = {"training": name.partition("__")[0].replace("_", " "), "joints (rad)": group[-1]["joint error"]}
+        line = {"learner": name.partition("__")[0].upper(), "joints (rad)": group[-1]["joint error"]}
         line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
         for column, found in ((f"s to {ENOUGH:.0%}", enough), ("twice in a row (s)", twice)):
             line[column] = found[0]["training s"] if found else "never"
@@ -169,6 +182,7 @@ def main(args: Args) -> None:
         measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
         return
     rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
+    args.publish("track_errors", markdown(errors(rows)), PAGE)
     args.publish("many", markdown(many(rows)), PAGE)
 
 

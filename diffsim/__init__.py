@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from diffsim import startup
 from diffsim.env import DiffEnv, check_seed
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Scene, SceneError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration, check_count
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import check_device, check_dtype

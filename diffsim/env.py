@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pkgutil
+from collections import deque
 from collections.abc import Iterable
 from numbers import Integral
 from typing import Any, Literal
@@ -21,6 +22,7 @@ from diffsim.robot.scene import Scene
 from diffsim.sim.adjoint import ClipAdjoint
 from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration, check_count, is_real
+from diffsim.sim.launcher import check_memory
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
@@ -50,6 +52,14 @@ class DiffEnv(VectorEnv):
     (gymnasium's SAME_STEP autoreset); the last one of the old episode is info["final_obs"]. No gradient crosses a
     reset. Up to `horizon` differentiable steps make a rollout, which `detach` ends; under torch.no_grad there is no
     limit.
+
+    Example:
+        env = diffsim.make("cartpole", num_envs=16, horizon=8)
+        obs, info = env.reset(seed=1)                                     # (16, 5)
+        action = torch.zeros(16, 1, requires_grad=True)
+        obs, reward, terminated, truncated, info = env.step(action)
+        reward.sum().backward()
+        obs = env.detach()                                                # the next rollout
 
     Args:
         task: task on the simulator's device and dtype; several environments may share it.
@@ -123,8 +133,11 @@ class DiffEnv(VectorEnv):
         self.qpos, self.qvel, self._obs, self.memory = self._draw_starts(1)[0]
         self._pinned: State | None = None
         self._disturb = self.task.disturb
-        # Start states of the whole rollout: one batch of operations, not one per step
-        self._starts, self._time = self._draw_starts(horizon), 0
+        # Start states of the next steps, drawn for many at once: one batch of operations, not one per step
+        numbers = task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory
+        drawn = f"start states of a horizon of {horizon:,} steps"
+        check_memory(drawn, num_envs, horizon * numbers * self.dtype.itemsize, self.device)
+        self._starts = deque(self._draw_starts(horizon))
 
     @property
     def np_random_seed(self) -> int:
@@ -147,9 +160,9 @@ class DiffEnv(VectorEnv):
         if self._pinned is not None:
             self.write_back(self._pinned)
         if self.device.type == "cuda":  # the next step draws start states, as it does in each replay of a graph
-            self._time = self.horizon
+            self._starts.clear()
         else:
-            self._starts, self._time = self._draw_starts(self.horizon), 0
+            self._starts = deque(self._draw_starts(self.horizon))
         return self._obs.clone(), {}
 
     @in_plain_mode
@@ -170,10 +183,9 @@ class DiffEnv(VectorEnv):
             RuntimeError: more than `horizon` differentiable steps without `detach`.
         """
         outcome = self._act(action)
-        if self._time == self.horizon:
-            self._starts, self._time = self._draw_starts(self.horizon), 0
-        starts, self._time = self._starts[self._time], self._time + 1
-        return self._conclude(*outcome, starts)
+        if not self._starts:  # steps without gradients may be more than `horizon`
+            self._starts.extend(self._draw_starts(self.horizon))
+        return self._conclude(*outcome, self._starts.popleft())
 
     def advance(self, action: Tensor) -> Step:
         """Do what `step` does except the reset: obs is info["final_obs"], and ended episodes wait for `reset`."""
@@ -264,7 +276,7 @@ class DiffEnv(VectorEnv):
     def detach(self) -> Tensor:
         """Cut the graph at the current state, begin a rollout there, and return observations (N, obs_dim)."""
         self._detach_state()
-        self._starts, self._time = self._draw_starts(self.horizon), 0
+        self._starts = deque(self._draw_starts(self.horizon))
         return self._obs.clone()
 
     def _detach_state(self) -> None:
@@ -354,7 +366,7 @@ class DiffEnv(VectorEnv):
         self.episode_step.copy_(state["episode_step"])
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
-        self._time = self.horizon
+        self._starts.clear()
 
     @torch.no_grad()
     def _draw_starts(self, steps: int) -> list[State]:

@@ -22,12 +22,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffsim.kernels import parameters as columns
-from diffsim.robot.constraint import LEAST_FRICTION, LEAST_WEIGHT, constrained
-from diffsim.robot.contact import declared_pairs, ground_pairs, pair_law
+from diffsim.kernels.thread.columns import LINK, Columns
+from diffsim.robot.constants import LEAST_FRICTION, LEAST_WEIGHT, constrained
+from diffsim.robot.contacts import declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import at_rest, control_range, label, motors, servos
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Scene, SceneError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
@@ -53,7 +54,7 @@ UNSUPPORTED |= {"site": "actuators at sites"}
 
 
 class _Robot:
-    """Reads and writes the parameters of an MjModel, and maps them to the columns of kernels/parameters.py.
+    """Reads and writes the parameters of an MjModel, and maps them to the columns of kernels/thread/columns.py.
 
     Attributes:
         file: the file's parameters, in float64.
@@ -167,18 +168,20 @@ class _Robot:
         nlink, mass, drive = self.scene.nlink, values["mass"][self.bodies, None], values["gain"]
         at, inertia = self._about(self.turn, self.place, values)
         ten = torch.cat((mass, mass * at, inertia[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]), 1)
-        links = ten.new_zeros(nlink, columns.LINK).index_add(0, self.link, ten)
-        none = 0 * values["armature"], links[:0, :2]
-        weight, constraints = self._constraints(values) if self.hard else none
+        links = ten.new_zeros(nlink, LINK).index_add(0, self.link, ten)
+        none = 0 * values["armature"], links[:0, :2], links[:0, :2]
+        weight, ground, pairs = self._constraints(values) if self.hard else none
         of_dofs = torch.stack((values["armature"], values["damping"], values["frictionloss"], weight))[:, self.first :]
         servo = torch.stack(
             (self.stiffness_of_gain * drive, self.damping_of_gain * drive + self.damping_of_kv * values["kv"])
         )
         of_servos = ten.new_zeros(2, nlink).index_add(1, self.motor_link, servo)[:, 1:]
         joints = torch.nn.functional.pad(torch.cat((of_dofs, of_servos)), (1, 0)).mT
-        return torch.cat([x.flatten() for x in (links, joints, self.gear * drive[:, None], constraints)])
+        motors = self.gear * drive[:, None]
+        groups = {"links": links, "joints": joints, "motors": motors, "ground": ground, "pairs": pairs}
+        return torch.cat([groups[name].flatten() for name in Columns._fields if name != "end"])
 
-    def _constraints(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _constraints(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the logarithms of MuJoCo's inverse weights of degrees of freedom, and the columns of contacts with the
         ground and of rows between bodies."""
         mass, (turning, moving) = values["mass"][self.bodies, None, None], self.jacobian.unbind(1)
@@ -197,7 +200,8 @@ class _Robot:
         rough = values["friction"][self.friction_geoms].amax(1).clamp(min=LEAST_FRICTION) * self.has_friction
         ground, between = rough.split((len(self.contact_body), len(self.touching)))
         friction = torch.cat((ground, ground.new_zeros(self.equalities), between))
-        return of_dofs.log(), torch.stack((friction, weights.log()), 1)
+        columns = torch.stack((friction, weights.log()), 1).split((len(self.contact_body), len(self.sums)))
+        return of_dofs.log(), *columns
 
     def model(self, values: dict[str, Tensor]) -> mujoco.MjModel:
         """Return a copy of the file's model with these parameters."""
@@ -243,15 +247,30 @@ class _Robot:
 class ParametricSimulator(Simulator):
     """A Simulator whose steps are differentiable in the robot's constants, which are the same in all environments.
 
+    `parameters` is the dictionary to fit: it starts with the file's values, in float64 on the CPU. Assign tensors that
+    require gradients, take steps and call backward. `adjustable(name)` and `elements(name)` say which of its rows may
+    change and whose they are.
+
+    Example:
+        from diffsim.parameters import ParametricSimulator
+        scene = diffsim.load_scene("robot.xml")
+        sim = ParametricSimulator(scene, 4, diffsim.Integration("mujoco", 8), horizon=1, dtype=torch.float64)
+        mass = sim.parameters["mass"].requires_grad_()                     # (nbody,) kg
+        sim.parameters = {"mass": mass}
+        qpos, qvel = torch.tensor(scene.qpos0).repeat(4, 1), torch.zeros(4, scene.nv).double()
+        sim.step(qpos, qvel, torch.zeros(4, scene.nu).double())[1].sum().backward()
+        print(mass.grad)
+
     Args:
         scene: without fluid, gravity compensation, tendons and actuators at sites.
-        num_envs: as for Simulator, like the rest.
+        num_envs: number of copies N of the robot.
         integration: contact model and substeps.
-        *args: control_dt and horizon.
+        *args: control_dt [s] and horizon of Simulator.
         **options: those of Simulator without factors, forces and division.
 
     Raises:
-        SceneError: the robot has one of these.
+        SceneError: the robot has fluid, gravity compensation, tendons or actuators at sites.
+        ValueError: another argument out of range, with what is allowed.
     """
 
     def __init__(
@@ -282,7 +301,7 @@ class ParametricSimulator(Simulator):
 
     @parameters.setter
     def parameters(self, values: Mapping[str, Tensor]) -> None:
-        if self._slot:
+        if self._window.used:
             raise RuntimeError("parameters cannot change within a rollout: call rewind() before")
         given = {name: self._robot.check(name, value) for name, value in values.items()}
         new, scene, launcher = load_scene(self._robot.model(self._robot.file | given)), self.scene, self._launcher
@@ -294,7 +313,7 @@ class ParametricSimulator(Simulator):
                 "file, because the kernels contain only what the file uses"
             )
         launcher.rewrite(scene, OF_MODEL)
-        self._versions = [version + 1 for version in self._versions]  # earlier steps have no adjoint any more
+        self._window.forget()  # earlier steps have no adjoint any more
         row = self._robot.columns(self._robot.file | given).to(self.device, self.dtype)
         self._given, self._factors = given, row.expand(self.num_envs, -1)
 

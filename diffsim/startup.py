@@ -108,7 +108,11 @@ def load(module: wp.Module, device: str, block_dim: int, name: str) -> None:
         if shutil.disk_usage(folder.parent).free < ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if name not in _announced and os.environ.get("RANK", "0") == "0":
-            print(f"compiling kernels for {name} (once, about 10 s) ...", file=sys.stderr, flush=True)
+            print(
+                f"compiling kernels for {name} (about 10 s, once for such a batch and options) ...",
+                file=sys.stderr,
+                flush=True,
+            )
         _announced.add(name)
         module.load(device, block_dim)
         _check_objects(folder)

@@ -21,7 +21,7 @@ import warp as wp
 from tyro.conf import Positional
 
 from diffsim import TASKS, SceneError, load_scene, startup
-from diffsim.robot.constraint import check_soft, constrained
+from diffsim.robot.constants import check_soft, constrained
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Contact, base_name, find_task
 from diffsim.training import command, evaluate, fail, load_policy
@@ -165,6 +165,8 @@ def check(robot: Positional[Path], contact: Contact = "mujoco") -> None:
         robot: MJCF file.
         contact: contact model of your task; soft needs constants in the file.
     """
+    if robot.suffix == ".py":
+        fail(f"{robot} is code: check reads the MJCF file of the task's robot, its asset")
     try:
         scene = load_scene(robot)
         check_soft(scene) if contact == "soft" else constrained(scene, 1e-3)

@@ -12,9 +12,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.scene import Array, Index, Scene
-from diffsim.training.directory import say
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array, Index
 from diffsim.training.evaluation import Evaluation
+from diffsim.training.log import say
 
 EPISODES = 8  # at most as many are measured
 SETTLING = 1.0  # s at the start of an episode that are left out
@@ -33,18 +34,22 @@ def of_evaluation(evaluation: Evaluation) -> Gait:
 
 
 def report(evaluation: Evaluation, directory: Path) -> None:
-    """Print a line for each foot and one for the robot, and leave all numbers in gait.csv."""
+    """Print `lines`, and leave all numbers in gait.csv."""
     if numbers := of_evaluation(evaluation):
-        say("\n".join(lines(numbers)))
+        if shown := lines(numbers):
+            say("\n".join(shown))
         rows = [(part, name, value) for part, values in numbers.items() for name, value in values.items()]
         with (directory / "gait.csv").open("w", newline="") as file:
             csv.writer(file).writerows([("part", "number", "value"), *rows])
 
 
 def lines(gait: Gait) -> list[str]:
-    """Write a line for each foot, and one for the robot."""
-    texts = (", ".join(f"{name} {value:.3g}" for name, value in numbers.items()) for numbers in gait.values())
-    return [f"{part:16}  {text}" for part, text in zip(gait, texts, strict=True)]
+    """Write a line for each foot that steps, and one for the robot; nothing of what only lies or slides."""
+    feet = {part: numbers for part, numbers in gait.items() if numbers.get("steps/s", 0.0) > 0}
+    robot = {name: value for name, value in gait.get("robot", {}).items() if name != "diagonal" or len(feet) == 4}
+    shown = feet | {"robot": robot} if feet and robot else feet
+    texts = (", ".join(f"{name} {value:.3g}" for name, value in numbers.items()) for numbers in shown.values())
+    return [f"{part:16}  {text}" for part, text in zip(shown, texts, strict=True)]
 
 
 def contact_bodies(scene: Scene) -> Index:

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.elements import muscles
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 from diffsim.tasks.base import ASSETS
 
 Frame = NDArray[np.uint8]  # (height, width, 3)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from diffsim.robot.contact import (
+from diffsim.robot.contacts import (
     HULL_POINTS,
     base_geoms,
     contact_points,

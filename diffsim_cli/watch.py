@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from diffsim.env import DiffEnv
+from diffsim.tasks import find_task
 from diffsim.training import Evaluation, SavedPolicy
 from diffsim.training.evaluation import fitting, make_env
 from diffsim.training.flags import Flags
@@ -23,6 +24,7 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
     """
     changes |= {"env": saved.task(changes.get("env"))}
     args = SimpleNamespace(**vars(Flags()) | saved.args | {"device": "cpu", "threads": 0} | changes)
+    args.task_class = find_task(args.env)
     env = make_env(args, num_envs, forces=forces)
     fitting(saved.network, env)
     compare(saved.robot, env.scene)

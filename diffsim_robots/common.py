@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -13,6 +15,15 @@ FREQUENCY_OF_PUSHES = 0.25  # 1/s
 def score(square: Tensor, scale: float) -> Tensor:
     """Return log(1 + square / scale): a parabola near 0 that keeps a slope far away but does not dominate."""
     return torch.log1p(square / scale)
+
+
+def add_up(terms: Mapping[str, Tensor], order: Iterable[tuple[str, ...]]) -> Tensor:
+    """Return the sum of terms (...): those of a tuple are added first; where one is missing, the others.
+
+    Another order would change the last bits of rewards, and so the policies that are trained by a seed.
+    """
+    sums = (reduce(torch.add, [terms[name] for name in names if name in terms]) for names in order)
+    return reduce(torch.add, sums)
 
 
 def push(noise: Tensor, sizes: tuple[float, float], control_dt: float) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffsim.robot.scene import Array
+from diffsim.robot.types import Array
 
 INSTANT = 1e-3  # s, over which a velocity is measured: exact to it squared, and to float32's rounding over it
 

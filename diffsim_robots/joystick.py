@@ -2,13 +2,13 @@
 
 The command is the velocity of the root along its own x and y axes [m/s] and its yaw rate [rad/s]; it changes within an
 episode. A clock moves the legs' reference: in the air they fold, on the ground their feet go backward as fast as the
-command asks. Robots are data: GO1, GO2, G1. Their figures are those of MuJoCo Menagerie's files.
+command asks. Robots are data, as in unitree.py.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -17,9 +17,9 @@ from torch import Tensor
 
 from diffsim.sim.elevation import Elevation
 from diffsim.symmetry.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, partners, reflections
-from diffsim.tasks.base import Contact, Task
+from diffsim.tasks.base import Contact, Parts, Task, width
 from diffsim.tasks.locomotion import rotate
-from diffsim_robots.common import push, score
+from diffsim_robots.common import add_up, push, score
 from diffsim_robots.feet import Feet
 from diffsim_robots.variation import Ranges
 
@@ -27,6 +27,29 @@ FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
 NEAR, SLIP = 0.01, 0.05  # m over the ground, within which a foot's speed counts as slip; (m/s)^2, the score's scale
 STANDING = 0.1  # share of commands that are zero; each of the three numbers of others is with the same probability
 SPIN = 20.0  # rad/s^2 of yaw for a pull of 1 m/s^2: torque that the ground's friction puts on turning feet
+WEIGHTS = {  # of the reward's terms; see reward_terms. A weight of 0 switches a term off
+    "alive": 4.0,  # a perfect step's reward
+    "track_linear_velocity": -0.5,
+    "track_angular_velocity": -0.25,
+    "lin_vel_z": -0.5,
+    "ang_vel_xy": -0.2,
+    "upright": -0.4,
+    "base_height": -0.2,
+    "pose": -1.2,
+    "action_rate": -2.2,
+    "foot_height": -0.4,
+    "foot_slip": -0.15,
+    "feet_apart": -1.0,
+}
+ORDER = (  # of additions, see add_up
+    ("alive",),
+    ("track_linear_velocity",),
+    ("track_angular_velocity",),
+    ("lin_vel_z", "ang_vel_xy"),
+    ("upright", "base_height"),
+    ("pose", "action_rate"),
+    ("foot_height", "foot_slip", "feet_apart"),
+)
 # Noise of the sensors, uniform to both sides: joints [rad], rates [rad/s], angular and linear velocity, gravity
 JOINT_NOISE, RATE_NOISE, GYRO_NOISE, VELOCITY_NOISE, GRAVITY_NOISE = 0.03, 0.5, 0.2, 0.1, 0.05
 
@@ -55,51 +78,18 @@ class Robot(NamedTuple):
     command: tuple[float, float, float] = (1.0, 0.6, 1.0)  # largest vx, vy [m/s] and yaw rate [rad/s]
 
 
-def quadruped(order: Sequence[str]) -> Robot:
-    """Unitree's, with the legs in this order; a trot."""
-    legs = tuple(
-        Leg(
-            (f"{name}_thigh", f"{name}_hip"),
-            {f"{name}_thigh": 0.2, f"{name}_calf": -0.4},
-            (0.19 if name[0] == "F" else -0.19, 0.14 if name[1] == "L" else -0.14),
-            0.0 if name in ("FL", "RR") else 0.5,
-        )
-        for name in order
-    )
-    joints = tuple(f"{name}_{part}" for name in order for part in ("hip", "thigh", "calf"))
-    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.072, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
-
-
-def humanoid() -> Robot:
-    """Unitree's G1 with 29 joints; a walk."""
-    leg = "hip_pitch hip_roll hip_yaw knee ankle_pitch ankle_roll".split()
-    arm = "shoulder_pitch shoulder_roll shoulder_yaw elbow wrist_roll wrist_pitch wrist_yaw".split()
-    parts = [("left_", leg), ("right_", leg), ("waist_", ["yaw", "roll", "pitch"]), ("left_", arm), ("right_", arm)]
-    stance, hang = (-0.312, 0.0, 0.0, 0.669, -0.363, 0.0), (0.2, 0.0, 0.6, 0.0, 0.0, 0.0)
-    legs = tuple(
-        Leg(
-            (f"{side}_hip_pitch", f"{side}_hip_roll"),
-            {f"{side}_hip_pitch": -0.4, f"{side}_knee": 0.8, f"{side}_ankle_pitch": -0.4},
-            (0.0, 0.12 if side == "left" else -0.12),
-            0.0 if side == "left" else 0.5,
-        )
-        for side in ("left", "right")
-    )
-    home = (*stance, *stance, 0.0, 0.0, 0.073, 0.2, *hang, 0.2, -0.2, *hang[1:])
-    joints = tuple(side + name for side, names in parts for name in names)
-    return Robot(joints, home, 0.755, legs, 0.65, 0.08, 1.4, (("right_", "left_"),), apart=0.13)
-
-
 class Joystick(Task):
     """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates).
 
-    Memory: command, clock in cycles, the last two actions, the noise of the sensors; then how late actions come, and a
-    push that is due.
+    Memory: memory_parts. The clock is in cycles, latency in control steps; a push is due in the next step.
+
+    Attributes:
+        weights: of the reward's terms, by name.
     """
 
     robot: ClassVar[Robot]
     contact: ClassVar[Contact] = "mujoco"
-    symmetric = True
+    symmetric, initial_gain = True, 0.01
     varied_by = "diffsim_robots.variation:Variation"
     ranges: ClassVar[Ranges] = {
         "friction": (0.7, 1.3),
@@ -114,8 +104,7 @@ class Joystick(Task):
     episode_length = 1000
 
     forward_column = None  # what counts is the command
-    alive: ClassVar[float] = 4.0  # reward of a perfect step
-    smooth: ClassVar[float] = 2.2  # weight of changes of the action
+    weights: ClassVar[dict[str, float]] = WEIGHTS
     # By how much the actions of an episode come late; how large the pushes are that come at random; how steadily
     # something pulls, as a slope, a load or rolling feet do [m/s^2]
     disturbances: Ranges = {"latency": (0.0, 0.0), "push": (0.0, 0.0), "pull": (0.0, 0.0)}
@@ -133,8 +122,11 @@ class Joystick(Task):
         legs = len(cls.robot.legs)
         gap = (("feet_apart", 1),) * bool(cls.robot.apart)
         cls.obs_parts = *seen, *private, *gap, ("feet_from_reference", legs), ("feet_slip", legs)
-        cls.actor_dim, cls.obs_dim = (sum(size for _, size in parts) for parts in (seen, cls.obs_parts))
-        cls.num_memory, cls.num_noise, cls.num_random = 19 + 4 * n, 20 + 2 * n, 25 + 2 * n
+        acted: Parts = (("last_action", n), ("action_before", n))
+        disturbed = ("noise", width(sensed)), ("latency", 1), ("pull", 3), ("push", 2)
+        cls.memory_parts = ("command", 3), ("clock", 1), *acted, *disturbed
+        cls.actor_dim, cls.obs_dim, cls.num_memory = map(width, (seen, cls.obs_parts, cls.memory_parts))
+        cls.num_noise, cls.num_random = 20 + 2 * n, 25 + 2 * n
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)
@@ -167,11 +159,6 @@ class Joystick(Task):
         self._feet = Feet.of(self.load_robot().mj_model, names, device, dtype)
         self._rest = robot.height + self._feet.places(self._home)[:, 2]  # m, of the feet, which sink in
 
-    def named(self, obs: Tensor) -> dict[str, Tensor]:
-        """The parts of observations (..., obs_dim) by the names of obs_parts."""
-        names, sizes = zip(*self.obs_parts, strict=True)
-        return dict(zip(names, obs.split(sizes, dim=-1), strict=True))
-
     @classmethod
     def has_mirror(cls) -> bool:
         return True
@@ -198,9 +185,14 @@ class Joystick(Task):
         """A command, a phase and a latency; no action yet."""
         drawn, phase, late, steady = rand[..., len(self.start) :].split((7, 1, 1, 3), dim=-1)
         least, most = self.disturbances["latency"]
-        nothing = torch.zeros_like(phase).expand(*phase.shape[:-1], 4 * self._n + 9)
-        parts = phase, nothing, least + (most - least) * late, self._pull(steady), nothing[..., :2]
-        return torch.cat((self._draw(drawn), *parts), dim=-1)
+        nothing = phase.new_zeros(*phase.shape[:-1], self.num_memory)
+        given = {"command": self._draw(drawn), "clock": phase, "pull": self._pull(steady)}
+        given["latency"] = least + (most - least) * late
+        return self._hold(self.recall(nothing) | given)
+
+    def _hold(self, parts: Mapping[str, Tensor]) -> Tensor:
+        """Return the memory (..., num_memory) that has these parts."""
+        return torch.cat([parts[name] for name, _ in self.memory_parts], dim=-1)
 
     def _pull(self, rand: Tensor) -> Tensor:
         """Draw what pulls during an episode, (..., 3) of rand (..., 3): along x and y [m/s^2], about z [rad/s^2]."""
@@ -214,28 +206,31 @@ class Joystick(Task):
         return (2.0 * size - 1.0) * self._most * kept * some
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
-        command, clock, last, _, late, pull, _ = self._recall(memory)
+        held = self.recall(memory)
         drawn, when, sensors, due = noise.split((7, 1, 9 + 2 * self._n, 3), dim=-1)
-        command = torch.where(when < self.control_dt * FREQUENCY_OF_COMMANDS, self._draw(drawn), command)
-        clock = (clock + self.control_dt * self.robot.cycle).remainder(1.0)
-        kick = push(due, self.disturbances["push"], self.control_dt)
-        return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise, late, pull, kick), dim=-1)
-
-    def _recall(self, memory: Tensor) -> tuple[Tensor, ...]:
-        """Command, clock, the last action, the one before, latency, pull, push; before the last three the noise."""
-        sizes = 3, 1, self._n, self._n, 9 + 2 * self._n, 1, 3, 2
-        command, clock, last, before, _, late, pull, kick = memory.split(sizes, -1)
-        return command, clock, last, before, late, pull, kick
+        held["command"] = torch.where(
+            when < self.control_dt * FREQUENCY_OF_COMMANDS, self._draw(drawn), held["command"]
+        )
+        held["clock"] = (held["clock"] + self.control_dt * self.robot.cycle).remainder(1.0)
+        held["last_action"], held["action_before"] = action, held["last_action"]
+        held["noise"] = (2.0 * sensors - 1.0) * self._noise
+        held["push"] = push(due, self.disturbances["push"], self.control_dt)
+        return self._hold(held)
 
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Pushes and pulls, and actions that come late: over a control step the mean of what the servos are given."""
         if not any(most for _, most in self.disturbances.values()):
             return qvel, action
-        *_, last, before, late, pull, kick = self._recall(memory)
+        held = self.recall(memory)
+        late, kick, pull = held["latency"], held["push"], self.control_dt * held["pull"]
         whole = late.clamp(max=1.0)
-        action = torch.lerp(torch.lerp(action, last, whole), before, late - whole)
-        pull = self.control_dt * pull
-        moved = qvel[..., :2] + kick + pull[..., :2], qvel[..., 2:5], qvel[..., 5:6] + pull[..., 2:], qvel[..., 6:]
+        action = torch.lerp(torch.lerp(action, held["last_action"], whole), held["action_before"], late - whole)
+        moved = (
+            qvel[..., :2] + kick + pull[..., :2],
+            qvel[..., 2:5],
+            qvel[..., 5:6] + pull[..., 2:],
+            qvel[..., 6:],
+        )
         return torch.cat(moved, dim=-1), action
 
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
@@ -246,14 +241,14 @@ class Joystick(Task):
         foot is."""
         position, quat, joints = qpos.split((3, 4, self._n), dim=-1)
         velocity, angular, rates = qvel.split((3, 3, self._n), dim=-1)
-        command, clock, last, before, *_ = self._recall(memory)
-        noise = memory[..., 4 + 2 * self._n : -6]
+        held = self.recall(memory)
+        command, clock, last = held["command"], held["clock"], held["last_action"]
         world = torch.stack((velocity, self._down.expand_as(velocity)), dim=-2)
         inverse = torch.cat((quat[..., :1], -quat[..., 1:]), dim=-1).unsqueeze(-2)
         velocity, gravity = rotate(inverse, world).unbind(dim=-2)
         sensed = torch.cat((velocity, angular, gravity, joints - self._home, 0.1 * rates), dim=-1)
         turn = 2.0 * math.pi * clock
-        private = sensed, position[..., 2:], last - before, joints - self.reference(command, clock)
+        private = sensed, position[..., 2:], last - held["action_before"], joints - self.reference(command, clock)
         place, speed = self._feet.motion(joints, rates)
         speed = speed + velocity.unsqueeze(-2) + torch.linalg.cross(angular.unsqueeze(-2), place)
         high = position[..., 2:] - (place * gravity.unsqueeze(-2)).sum(-1)
@@ -264,7 +259,7 @@ class Joystick(Task):
         slip = (1.0 - swing) * torch.exp(-(high.clamp(min=0.0) / NEAR).square()) * score(along, SLIP)
         gap = (place[..., :1, 1] - place[..., 1:2, 1],) * bool(self.robot.apart)
         feet = *gap, high - self._rest - self.robot.lift * swing, slip
-        return torch.cat((sensed + noise, last, command, turn.sin(), turn.cos(), *private, *feet), dim=-1)
+        return torch.cat((sensed + held["noise"], last, command, turn.sin(), turn.cos(), *private, *feet), dim=-1)
 
     @staticmethod
     def _rise(ground: Elevation, x: Tensor, quat: Tensor, place: Tensor) -> Tensor:
@@ -289,24 +284,33 @@ class Joystick(Task):
         return self._home + self._moving(command) * self._fold * fold + command @ self._stride * stride
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Both velocities, then an upright, level, calm root at its height; the reference's joints and feet, no slip,
-        legs that do not cross, smooth actions."""
+        return add_up(self.reward_terms(obs, action), ORDER)
+
+    def reward_terms(self, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
+        """Both velocities, then a calm, upright, level root at its height; the reference's joints, smooth actions; the
+        reference's feet, no slip, legs that do not cross."""
         part = self.named(obs)
         velocity, angular, gravity = (
             part[f"true_{name}"] for name in ("base_lin_vel", "base_ang_vel", "projected_gravity")
         )
-        command, height, change = part["command"], part["height"], part["action_change"]
-        error, lift, slip = part["joints_from_reference"], part["feet_from_reference"], part["feet_slip"]
-        speed = score((velocity[..., :2] - command[..., :2]).square().sum(-1), 0.03)
-        yaw = score((angular[..., 2] - command[..., 2]).square(), 0.03)
-        calm = 0.5 * score(velocity[..., 2].square(), 0.5) + 0.2 * score(angular[..., :2].square().sum(-1), 4.0)
-        level = 0.4 * score(gravity[..., :2].square().sum(-1), 0.1)
-        level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
-        gait = 1.2 * score(error.square(), 0.05).mean(-1) + self.smooth * score(change.square().mean(-1), 0.2)
-        feet = 0.4 * score(lift.square(), 0.0004).mean(-1) + 0.15 * slip.mean(-1)
+        command, height = part["command"], part["height"][..., 0]
+        terms = {
+            "alive": torch.ones_like(height),
+            "track_linear_velocity": score((velocity[..., :2] - command[..., :2]).square().sum(-1), 0.03),
+            "track_angular_velocity": score((angular[..., 2] - command[..., 2]).square(), 0.03),
+            "lin_vel_z": score(velocity[..., 2].square(), 0.5),
+            "ang_vel_xy": score(angular[..., :2].square().sum(-1), 4.0),
+            "upright": score(gravity[..., :2].square().sum(-1), 0.1),
+            "base_height": score((height - self.robot.height).square(), 0.01),
+            "pose": score(part["joints_from_reference"].square(), 0.05).mean(-1),
+            "action_rate": score(part["action_change"].square().mean(-1), 0.2),
+            "foot_height": score(part["feet_from_reference"].square(), 0.0004).mean(-1),
+            "foot_slip": part["feet_slip"].mean(-1),
+        }
         if self.robot.apart:
-            feet = feet + score((self.robot.apart - part["feet_apart"][..., 0]).clamp(min=0.0).square(), 0.003)
-        return self.alive - 0.5 * speed - 0.25 * yaw - calm - level - gait - feet
+            near = (self.robot.apart - part["feet_apart"][..., 0]).clamp(min=0.0)
+            terms["feet_apart"] = score(near.square(), 0.003)
+        return {name: self.weights[name] * term for name, term in terms.items()}
 
     def metadata(self) -> dict[str, str]:
         """Tell `export` what a program needs to know of the task; the command's name is mjlab's."""
@@ -323,23 +327,3 @@ class Joystick(Task):
         """Tilted by more than 60 degrees, or the root below 60 % of its height."""
         part = self.named(obs)
         return (part["true_projected_gravity"][..., 2] > -0.5) | (part["height"][..., 0] < 0.6 * self.robot.height)
-
-
-class Go1(Joystick):
-    """12 joints; action: targets of the servos."""
-
-    name, asset, robot = "go1", "go1.xml", quadruped(("FR", "FL", "RR", "RL"))
-
-
-class Go2(Joystick):
-    """12 joints; action: targets of servos on the motors."""
-
-    name, asset, robot = "go2", "go2.xml", quadruped(("FL", "FR", "RL", "RR"))
-
-
-class G1(Joystick):
-    """29 joints; action: targets of the servos."""
-
-    name, asset, robot = "g1", "g1.xml", humanoid()
-    alive, smooth = 2.5, 1.0
-    ranges = {name: Joystick.ranges[name] for name in ("friction", "mass", "motor", "latency")} | {"push": (0.5, 1.5)}

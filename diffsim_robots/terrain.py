@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from diffsim.robot.scene import Array
+from diffsim.robot.types import Array
 
 MOST_SEGMENTS = 10_000  # of rough ground
 STEEPEST = 45.0  # degrees, of uneven ground that robots are put on
@@ -36,6 +36,10 @@ def step(height: float, start: float = 1.0) -> Array:
 
 def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float = 50.0, start: float = 1.0) -> Array:
     """Make segments (K, 2) of random slope, then level ground; K = 3 + length / segment, rounded.
+
+    Example:
+        from diffsim_robots.terrain import rough
+        env = diffsim.make("hopper", num_envs=16, terrain=rough(seed=1))
 
     Args:
         seed: of the slopes, an integer of at least 0; each has another profile.

@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 import torch
 
 from diffsim.env import DiffEnv
-from diffsim.robot.scene import FACTORS, Array
+from diffsim.robot.scene import FACTORS
+from diffsim.robot.types import Array
 from diffsim.sim.integration import is_real
 from diffsim.tasks import Task, TaskError, base_name
 from diffsim_robots.terrain import STEEPEST, uneven

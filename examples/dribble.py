@@ -1,10 +1,11 @@
 """A Go2 that dribbles a ball to commanded places; docs/tasks.md.
 
 git clone https://github.com/google-deepmind/mujoco_menagerie
-python rpo.py --env examples/dribble.py --horizon 16 --adjoint-clip 5 --initial-log-std -2 --num-envs 128 \\
-    --iterations 1600 --critic-hidden 256 128 --critic-lr 1e-3
+python rpo.py --env examples/dribble.py
 python benchmarks/own_tasks.py runs/<run> --own examples/dribble.py --file mujoco_menagerie/unitree_go2/scene.xml
 """
+
+from typing import ClassVar
 
 import mujoco
 import torch
@@ -13,8 +14,10 @@ from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
-from diffsim_robots.common import score
-from diffsim_robots.joystick import Go2
+from diffsim.tasks.base import Defaults
+from diffsim_robots.common import add_up, score
+from diffsim_robots.joystick import ORDER
+from diffsim_robots.unitree import BEGIN, Go2
 
 RADIUS, MASS, DRAG = 0.11, 0.43, 0.002  # m, kg, N s/m and N m s: a football of size 5 that comes to rest
 STIFFNESS, RANGE = 40.0, {"hip": (-0.4, 0.4), "thigh": (0.2, 1.6), "calf": (-2.5, -1.1)}  # N m/rad, rad: as of "go2"
@@ -31,8 +34,12 @@ class Dribble(Go2):
     """
 
     name, asset, symmetric = "dribble", "mujoco_menagerie/unitree_go2/scene.xml", False
+    initial_gain = 1.0
+    defaults: ClassVar[Defaults] = {"rpo": BEGIN | {"horizon": 16, "num_envs": 128, "iterations": 1600}}
     num_random = Go2.num_random + 13
-    actor_dim, obs_dim, obs_parts = BALL + (Go2.actor_dim or 0), BALL + Go2.obs_dim, ()
+    actor_dim, obs_dim = BALL + (Go2.actor_dim or 0), BALL + Go2.obs_dim
+    obs_parts = (("ball", 2), ("ball_velocity", 2), ("place", 2), ("place_velocity", 2), *Go2.obs_parts)
+    weights = Go2.weights | {"ball_velocity": -0.5}
 
     @classmethod
     def load_robot(cls) -> Scene:
@@ -107,12 +114,13 @@ class Dribble(Go2):
         return torch.stack((c * vectors[..., 0] + s * vectors[..., 1], c * vectors[..., 1] - s * vectors[..., 0]), -1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Go2's, and the ball's velocity towards the place."""
-        _, rolls, _, speed = obs[..., :BALL].split(2, dim=-1)
-        return super().reward(obs[..., BALL:], action) - 0.5 * score((rolls - speed).square().sum(-1), 0.1)
+        return add_up(self.reward_terms(obs, action), (*ORDER, ("ball_velocity",)))
 
-    def terminated(self, obs: Tensor) -> Tensor:
-        return super().terminated(obs[..., BALL:])
+    def reward_terms(self, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
+        """Go2's, and the ball's velocity towards the place."""
+        part = self.named(obs)
+        off = score((part["ball_velocity"] - part["place_velocity"]).square().sum(-1), 0.1)
+        return super().reward_terms(obs, action) | {"ball_velocity": self.weights["ball_velocity"] * off}
 
     def achieved(self, qpos: Tensor, memory: Tensor) -> Tensor:
         """Tell which balls (...) are at their place."""

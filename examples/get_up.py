@@ -19,11 +19,11 @@ from diffsim.tasks import Task
 from diffsim.tasks.base import ASSETS
 from diffsim.tasks.locomotion import rotate
 from diffsim_robots.common import score
-from diffsim_robots.joystick import humanoid
+from diffsim_robots.unitree import G1
 
 HEIGHT, LOWEST, REACH = 0.755, 0.3, 1.5  # m, of the pelvis, standing and lying at the start; rad, of targets from home
 LEGS, ARMS = (150.0, 5.0), (50.0, 2.0)  # N m/rad and N m s/rad of their servos; the waist has the legs'
-HOME = humanoid().home
+HOME = G1.robot.home
 AID = 0.8  # largest share of gravity that an episode is without: robots that are lighter get up earlier in training
 
 

@@ -40,6 +40,7 @@ def main(args: Args) -> None:
     env.reset(seed=args.seed)
     learner = pfpn.PPO(settings, env)
     head, rows = learner.actor.head, list[dict[str, object]]()
+    assert isinstance(head, pfpn.ParticleHead)
     places = {joint: list[list[float]]() for joint in JOINTS}
     steps = [k * settings.num_envs * settings.horizon for k in range(0, args.iterations + 1, EVERY)]
     for iteration in range(args.iterations + 1):

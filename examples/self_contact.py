@@ -1,20 +1,20 @@
 """A G1 whose legs touch each other in training, so that its reward needs no term for them; docs/tasks.md.
 
-python rpo.py --env examples/self_contact.py:Whole --horizon 16 --adjoint-clip 5 --initial-log-std -3 \\
-    --num-envs 1024 --iterations 600 --critic-hidden 256 128 --critic-lr 1e-3 --device cuda
+python rpo.py --env examples/self_contact.py:Whole --device cuda
 python benchmarks/joystick.py runs/<run> --own examples/self_contact.py:Whole --push 2 \\
     --file mujoco_menagerie/unitree_g1/scene.xml
 """
 
 from itertools import product
+from typing import ClassVar
 
 import mujoco
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.pairs import with_pairs
 from diffsim.robot.scene import Scene
-from diffsim.tasks.base import ASSETS
-from diffsim_robots.joystick import G1, humanoid
+from diffsim.tasks.base import ASSETS, Defaults
+from diffsim_robots.unitree import BEGIN, G1
 
 LEG = "hip_roll", "hip_yaw", "knee", "ankle_roll"  # links whose first geoms touch those of the other leg
 
@@ -22,7 +22,10 @@ LEG = "hip_roll", "hip_yaw", "knee", "ankle_roll"  # links whose first geoms tou
 class Ghost(G1):
     """A G1 whose legs pass through each other, as the shipped one's, without a reward for feet that stay apart."""
 
-    name, robot = "ghost", humanoid()._replace(apart=0.0)
+    name, robot, initial_gain = "ghost", G1.robot._replace(apart=0.0), 1.0
+    defaults: ClassVar[Defaults] = {
+        "rpo": BEGIN | {"horizon": 16, "initial_log_std": -3.0, "num_envs": 1024, "iterations": 600}
+    }
 
 
 class Whole(Ghost):

@@ -16,7 +16,7 @@ from torch import Tensor
 from diffsim.tasks import Contact
 from diffsim.tasks.base import ASSETS
 from diffsim_robots.imitation.task import HumanoidImitation
-from diffsim_robots.joystick import Go2
+from diffsim_robots.unitree import Go2
 
 STIFFNESS = 2.0  # 1/rad: a servo gives its motor's largest torque half a radian from the target
 
@@ -34,7 +34,7 @@ def with_servos(file: str) -> mujoco.MjModel:
 class HumanoidServo(HumanoidImitation):
     """21 joints; action: targets of the servos. It jogs: no policy kept the run of humanoid_imitation, 8.5 m/s."""
 
-    name, asset = "humanoid_servo", with_servos("humanoid.xml")
+    name, asset, like = "humanoid_servo", with_servos("humanoid.xml"), None
     default_clip = str(Path(__file__).with_name("humanoid_jog.npz"))
     contact: ClassVar[Contact] = "mujoco"
     control_dt, episode_length, substeps = 1 / 30, 600, 8  # 20 s
@@ -43,7 +43,7 @@ class HumanoidServo(HumanoidImitation):
 class Dog(HumanoidImitation):
     """The robot of go2, 12 joints; action: targets of its servos."""
 
-    name, asset = "dog", Go2.asset
+    name, asset, like = "dog", Go2.asset, None
     contact: ClassVar[Contact] = "mujoco"
     control_dt, episode_length, substeps = 1 / 30, 600, 8
     obs_dim = 39

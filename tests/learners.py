@@ -20,7 +20,8 @@ import torch
 from diffsim.training import Run, command
 
 ROOT = Path(__file__).resolve().parents[1]
-PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
+FOLDERS = str(ROOT), str(ROOT / "baselines")
+PATH = {"PYTHONPATH": os.pathsep.join([*FOLDERS, *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
 # Rollouts of cartpole with a time-out on the way (240 steps), an evaluation before the end and one at it.
 _SMALL = (
     "--env cartpole --num-envs 3 --horizon 32 --iterations 10 --eval-every 4 --eval-episodes 3 --quiet --device cpu"

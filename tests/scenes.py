@@ -29,14 +29,15 @@ ROBOTS = [name for name in SOFT if TASKS[name].asset == f"{name}.xml"]  # one ta
 # Together these have every feature of a task's robot: a kernel takes seconds to compile.
 DISTINCT = ("half_cheetah", "humanoid", "humanoid_mtu", "swimmer")
 
-# A free sphere of 2 kg; it falls, rolls, slides and rests.
-BALL = """
-<mujoco>
-  <option cone="elliptic"/>
-  <custom>
+FIRM = """<custom>
     <numeric name="k_n" data="2e4"/> <numeric name="k_d" data="2e4"/> <numeric name="k_t" data="50"/>
     <numeric name="mu" data="0.5"/>
-  </custom>
+  </custom>"""
+
+# A free sphere of 2 kg; it falls, rolls, slides and rests.
+BALL = f"""
+<mujoco>
+  <option cone="elliptic"/> {FIRM}
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1"/>
     <body pos="0 0 1"> <freejoint/> <geom type="sphere" size="0.1" mass="2"/> </body>
@@ -166,13 +167,9 @@ GRIPPER = """
 </mujoco>"""
 
 # It has thrusters on its body and on its arm, beside a tendon of the arm and a motor.
-DRONE = """
+DRONE = f"""
 <mujoco>
-  <compiler angle="radian"/> <option cone="elliptic" integrator="implicitfast"/>
-  <custom>
-    <numeric name="k_n" data="2e4"/> <numeric name="k_d" data="2e4"/> <numeric name="k_t" data="50"/>
-    <numeric name="mu" data="0.5"/>
-  </custom>
+  <compiler angle="radian"/> <option cone="elliptic" integrator="implicitfast"/> {FIRM}
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1"/>
     <body pos="0 0 1">

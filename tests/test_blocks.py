@@ -1,4 +1,4 @@
-"""Blocks of environments in vectors: every law as in float64, whatever the neighbours and the block's edges."""
+"""Blocks of environments in vectors, of any size and at their edges; what holds in them is in test_properties.py."""
 
 from __future__ import annotations
 
@@ -11,99 +11,36 @@ import numpy as np
 import pytest
 import torch
 from scenes import (
-    BALL,
-    BAR,
     PENDULUM,
     acting_states,
-    free_states,
-    grounded_states,
-    leg_scene,
     parse,
     run,
-    small_scene,
     task_scene,
 )
-from test_terrain import HILLS, everywhere, hopping, pressed
 
-from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.options import BLOCKS
 from diffsim.sim.simulator import Simulator
 
 CONTROL_DT = 1 / 60
-SEMI, IMPLICIT = (Integration("soft", 8, implicit) for implicit in (False, True))
-MUJOCO = Integration("mujoco", 4, tolerance=1e-6)
+SEMI = Integration("soft", 8)
 _, SMALL, BLOCK = BLOCKS
-COUNT = BLOCK + 1
 
 
-def case(name: str, rng: np.random.Generator):
-    """A scene and states of COUNT environments in which all of its laws act; most are other tests' scenes."""
-    if name == "leg":
-        return grounded_states(leg_scene(grounded=True), COUNT, rng)
-    if name == "fish":
-        scene = small_scene("fluid")
-        return scene, free_states(scene, COUNT, rng)
-    if name in ("ball on hills", "bar on hills"):
-        scene = parse(BAR if name == "bar on hills" else BALL).with_terrain(HILLS)
-        return scene, pressed(scene, everywhere(rng)[:COUNT], rng)
-    if name == "hopper on hills":  # elsewhere for each
-        return hopping(HILLS + np.linspace(-0.6, 0.6, COUNT)[:, None, None] * [1, 0], COUNT, rng)
-    return task_scene(name), acting_states(task_scene(name), COUNT, rng)
-
-
-def step(scene, states, dtype, integration, weights=None, **options):
-    """State after a control step, its gradient in all that a step takes, and the simulator."""
-    count = len(states[0])
-    sim = Simulator(scene, count, integration, CONTROL_DT, dtype=dtype, **options)
-    inputs = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in states]
-    rng = np.random.default_rng(0)
-    if options.get("factors"):
-        sim.factors = torch.tensor(rng.uniform(0.6, 1.4, (COUNT, len(FACTORS)))[:count], dtype=dtype).requires_grad_()
-        inputs.append(sim.factors)
-    if options.get("forces"):
-        forces = rng.normal(size=(COUNT, scene.nbody, 6))[:count]
-        sim.forces = torch.tensor(forces, dtype=dtype).requires_grad_()
-        inputs.append(sim.forces)
-    outputs = sim.step(*inputs[:3])
+def step(states, **options):
+    """State of hoppers after a control step, and its gradient."""
+    sim = Simulator(task_scene("hopper"), len(states[0]), SEMI, CONTROL_DT, **options)
+    inputs = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in states]
+    outputs = sim.step(*inputs)
     gradients = torch.autograd.grad([x.sum() for x in outputs], inputs)
-    return [x.detach().double() for x in (*outputs, *gradients)], sim
-
-
-@pytest.mark.parametrize(
-    "name, integration, options",
-    [
-        ("ant", SEMI, {}),
-        pytest.param("hopper", SEMI, {"forces": True}, marks=pytest.mark.slow),
-        pytest.param("fish", SEMI, {}, marks=pytest.mark.slow),
-        pytest.param("half_cheetah", IMPLICIT, {}, marks=pytest.mark.slow),
-        pytest.param("leg", SEMI, {"factors": True}, marks=pytest.mark.slow),
-        pytest.param("hopper on hills", SEMI, {}, marks=pytest.mark.slow),
-        pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),
-        pytest.param("ball on hills", MUJOCO, {}, marks=pytest.mark.slow),
-        ("bar on hills", MUJOCO, {"factors": True}),
-    ],
-)
-def test_laws_are_those_of_float64(name, integration, options, rng):
-    scene, states = case(name, rng)
-    states = tuple(x.astype(np.float32) for x in states)
-    block, sim = step(scene, states, torch.float32, integration, **options)
-    exact, _ = step(scene, states, torch.float64, integration, **options)
-    assert not sim.nonfinite.any()
-    for found, expected in zip(block, exact, strict=True):
-        if not expected.numel():  # the ball has no motor
-            continue
-        error = (found - expected).abs().flatten(1).amax(1) / expected.abs().max()
-        assert (
-            error.median() < 2e-6 and error.max() < 2e-4
-        )  # the largest where a contact sticks in one, slides in the other
+    return [x.detach() for x in (*outputs, *gradients)]
 
 
 @pytest.fixture(scope="module")
 def hoppers():
     """States of the hopper beyond the second block of 16, and their step."""
     states = acting_states(task_scene("hopper"), 2 * BLOCK + 1, np.random.default_rng(1))
-    return states, step(task_scene("hopper"), states, torch.float32, SEMI)[0]
+    return states, step(states)
 
 
 @pytest.mark.parametrize("count", [2, 7, SMALL, 15, BLOCK, 17])
@@ -111,42 +48,22 @@ def hoppers():
 def test_an_environment_does_not_depend_on_its_place_in_a_block(count, last, hoppers):
     states, expected = hoppers
     part = slice(-count, None) if last else slice(count)
-    found, sim = step(task_scene("hopper"), tuple(x[part] for x in states), torch.float32, SEMI)
-    assert sim.nonfinite.shape == (count,)
-    for x, y in zip(found, expected, strict=True):
+    for x, y in zip(step([x[part] for x in states]), expected, strict=True):
         torch.testing.assert_close(x, y[part], rtol=0, atol=0)
 
 
 def test_one_environment_is_no_block(hoppers):
     """The scalar kernel, whose sums are rounded otherwise."""
     states, expected = hoppers
-    found, _ = step(task_scene("hopper"), tuple(x[:1] for x in states), torch.float32, SEMI)
-    for x, y in zip(found, expected, strict=True):
+    for x, y in zip(step([x[:1] for x in states]), expected, strict=True):
         torch.testing.assert_close(x, y[:1], rtol=1e-5, atol=1e-5 * y.abs().max().item())
 
 
 @pytest.mark.parametrize("threads", [2, 3, 16])
 def test_threads_take_whole_blocks(threads, hoppers):
     states, expected = hoppers
-    for x, y in zip(step(task_scene("hopper"), states, torch.float32, SEMI, threads=threads)[0], expected, strict=True):
+    for x, y in zip(step(states, threads=threads), expected, strict=True):
         torch.testing.assert_close(x, y, rtol=0, atol=0)
-
-
-def test_a_gradient_that_is_not_finite_is_counted_once(hoppers):
-    """And contained: it is zero, and the others are as beside a finite one."""
-    states, expected = hoppers
-    sim = Simulator(task_scene("hopper"), len(states[0]), SEMI, CONTROL_DT)
-    inputs = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in states]
-    outputs = sim.step(*inputs)
-    weights = [torch.ones_like(x) for x in outputs]
-    weights[0][[5, -1], 1] = torch.nan
-    gradients = torch.autograd.grad(outputs, inputs, weights)
-    assert sim.nonfinite_gradients.nonzero().flatten().tolist() == [5, 2 * BLOCK]
-    assert sim.nonfinite_gradients[5] == sim.nonfinite_gradients[-1] == 1
-    others = [k for k in range(2 * BLOCK) if k != 5]
-    for gradient, wanted in zip(gradients, expected[2:], strict=True):
-        assert (gradient[[5, -1]] == 0).all()
-        torch.testing.assert_close(gradient[others].double(), wanted[others], rtol=0, atol=0)
 
 
 def test_sines_of_large_angles():
@@ -208,10 +125,9 @@ def test_processors_without_wide_registers(tmp_path, hoppers):
     code = f"""
 import numpy as np, torch, warp as wp
 wp.config.cpu_compiler_flags = ""
-from scenes import task_scene
-from test_blocks import SEMI, step
+from test_blocks import step
 states = [x for x in np.load({str(tmp_path / "states.npz")!r}).values()]
-torch.save(step(task_scene("hopper"), states, torch.float32, SEMI)[0], {str(tmp_path / "found.pt")!r})
+torch.save(step(states), {str(tmp_path / "found.pt")!r})
 """
     subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True)
     for x, y in zip(torch.load(tmp_path / "found.pt"), expected, strict=True):

@@ -20,7 +20,7 @@ from test_pairs import needs_drift
 
 import diffsim
 import rpo
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.training import load_policy
 from diffsim_cli.commands import main as diffsim_main
 

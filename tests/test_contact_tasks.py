@@ -94,6 +94,10 @@ def test_the_gait_leads_behind_the_ball_then_to_its_place(field: Path) -> None:
     assert command[3, 0] == -1.0 and command[3, 1] > 0.3  # backward, away from the line
     torch.testing.assert_close(obs[1, :2], torch.tensor([0.0, -0.4]).double())
     assert not task.achieved(qpos, memory).any() and task.achieved(qpos, qpos[:, 19:21]).all()
+    reward, rolls = task.reward(obs, obs), obs + torch.eye(task.obs_dim).double()[2]  # at 1 m/s
+    wanted = obs[:, 6:8] - torch.tensor([1.0, 0.0]).double()
+    loss = 0.5 * ((1 + wanted.square().sum(1) / 0.1).log() - (1 + obs[:, 6:8].square().sum(1) / 0.1).log())
+    torch.testing.assert_close(task.reward(rolls, rolls), reward - loss)
 
 
 @pytest.mark.unoptimized

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import csv
 import dataclasses
 import functools
@@ -10,6 +11,7 @@ import importlib
 import json
 import re
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import mean, median, pstdev
@@ -155,27 +157,47 @@ def test_no_spread_of_a_single_seed(page: Path) -> None:
     assert not re.search(r"±\s*0(?![.\d])", page.read_text()), "the spread of one run is not 0: print the seed count"
 
 
-# Where the numbers before it come from: <!-- =FILE:COLUMN:KEY=VALUE&KEY=VALUE:RULES -->. RULES are as many as the
-# numbers, joined by commas; " / " divides two such sources. FILE is in results/, or begins with diffsim/.
+# Where numbers of a page come from. In the text, after them: <!-- =FILE:COLUMN:KEY=VALUE&KEY=VALUE:RULES -->. Or in a
+# list at the page's end, which leaves the text readable: <!-- numbers, lines of "PHRASE | FILE:COLUMN:...:RULES" with
+# phrases that the page has once, and -->. RULES are as many as the last numbers before the mark or of the phrase,
+# joined by commas. VALUE|VALUE takes rows of both, " / " divides two such sources, "; " joins them. FILE is in
+# results/, or begins with diffsim/.
 MARK = re.compile(r"(.*?)<!-- =(.+?) -->")
+LIST = re.compile(r"^<!-- numbers\n(.*?)^-->$", re.MULTILINE | re.DOTALL)
 RULES: dict[str, Callable[[list[float]], float]] = {
     **{"median": median, "mean": mean, "min": min, "max": max, "sum": sum, "count": len},
     "std": pstdev,
     "percent": lambda values: 100 * median(values),
+    "mean percent": lambda values: 100 * mean(values),
     "worst": lambda values: 100 * min(values),
+    "best": lambda values: 100 * max(values),
     "milli": lambda values: 1000 * median(values),
+    "millions": lambda values: median(values) / 1e6,
 }
+
+
+def sources(page: Path) -> Iterator[tuple[str, str]]:
+    """The text before each mark, or a phrase of the list at the page's end, and where its last numbers come from."""
+    text = page.read_text()
+    yield from MARK.findall(text)
+    body = " ".join(LIST.sub("", text).split())
+    for line in "".join(LIST.findall(text)).splitlines():
+        phrase, _, source = line.rpartition(" | ")
+        assert body.count(phrase) == 1, f"{page.name} has {phrase!r} {body.count(phrase)} times"
+        yield phrase, source
 
 
 def recompute(source: str) -> list[float]:
     """What a mark asks for."""
+    if "; " in source:
+        return [value for each in source.split("; ") for value in recompute(each)]
     if " / " in source:
         above, below = map(recompute, source.split(" / "))
         return [one / other for one, other in zip(above, below, strict=True)]
     file, column, where, rules = source.split(":")
     rows = read_csv(ROOT / file if file.startswith("diffsim/") else ROOT / "results" / file)
     wanted = [part.split("=") for part in where.split("&") if part]
-    found = [row for row in rows if all(same(row[key], value) for key, value in wanted)]
+    found = [row for row in rows if all(any(same(row[key], v) for v in value.split("|")) for key, value in wanted)]
     values = [0.0 if rules == "count" else float(row[column].rstrip("%")) for row in found if row[column]]
     assert values, f"{source}: no such rows"
     return [RULES[rule](values) for rule in rules.split(",")]
@@ -183,13 +205,25 @@ def recompute(source: str) -> list[float]:
 
 @each_page
 def test_marked_numbers_are_those_of_their_files(page: Path) -> None:
-    for before, source in MARK.findall(page.read_text()):
+    for before, source in sources(page):
         expected, shown = recompute(source), re.findall(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?", before)
         assert len(shown) >= len(expected), f"{page.name}: no number before {source}"
         for number, value in zip(shown[-len(expected) :], expected, strict=True):
             unit = 10.0 ** -len(number.partition(".")[2])
             off = abs(float(number.replace(",", "")) - value)
             assert off <= 0.501 * unit, f"{page.name}: {number} is {value:.6g}, by {source}"
+
+
+def test_a_list_of_numbers_finds_a_wrong_one(tmp_path: Path) -> None:
+    path = tmp_path / "page.md"
+    source = "h200/cells.csv:return:learner=rpo&task=ant:median,max"
+    for phrase, error in (("7,929 (8,430)", ""), ("7,928 (8,430)", "7,928 is 7929"), ("7,929", "no number")):
+        path.write_text(f"It returns {phrase}.\n\n<!-- numbers\n{phrase} | {source}\n-->\n")
+        with pytest.raises(AssertionError, match=error) if error else contextlib.nullcontext():
+            test_marked_numbers_are_those_of_their_files(path)
+    path.write_text(f"Twice 7,929, once 7,929.\n<!-- numbers\n7,929 | {source}\n-->\n")
+    with pytest.raises(AssertionError, match="2 times"):
+        test_marked_numbers_are_those_of_their_files(path)
 
 
 # Links and files ------------------------------------------------------------------------------------------------------
@@ -237,6 +271,30 @@ def test_readme_links_the_page_of_every_learner() -> None:
     assert all(path.stem.startswith(links[path.stem]) for path in LEARNERS)
 
 
+@each_page
+def test_formulas_are_safe_from_markdown(page: Path) -> None:
+    """GitHub drops a backslash before punctuation, except in $`...`$ and in blocks."""
+    text = re.sub(r"\$`[^`\n]*`\$|`[^`\n]*`", "", FENCE.sub("", page.read_text()))
+    assert not [each for each in re.findall(r"\$([^$\n]+)\$", text) if re.search(r"\\[^\w\s]", each)]
+    assert "$$" not in text
+
+
+def test_the_site_builds(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason='pip install -e ".[docs]"')
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "<math" in (tmp_path / "physics" / "index.html").read_text()
+
+
+def test_the_site_has_all_pages() -> None:
+    text = (ROOT / "mkdocs.yml").read_text()
+    assert {path.name for path in (ROOT / "docs").glob("*.md")} <= {*re.findall(r"\w+\.md", text)}
+    assert all(
+        f"]({path.name})" in (ROOT / "docs" / "index.md").read_text() for path in PAGES[3:] if path.stem != "index"
+    )
+
+
 # Flags ----------------------------------------------------------------------------------------------------------------
 
 
@@ -267,6 +325,7 @@ def of_argparse(script: Path) -> set[str]:
 
 ANY = {flag for script in SCRIPTS for flag in flags(script)}
 ANY |= {flag for path in ("commands.py", "tune/__init__.py") for flag in of_commands(ROOT / "diffsim_cli" / path)}
+ANY |= of_commands(ROOT / "examples" / "identify.py")
 ANY |= {f"--{field.name}" for field in dataclasses.fields(view.Args)}
 
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 from diffsim.training.checkpoint import POLICIES
-from diffsim_robots.joystick import Go2
+from diffsim_robots.unitree import Go2
 
 
 def test_a_loop_ends_where_it_begins() -> None:

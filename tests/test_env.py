@@ -381,7 +381,10 @@ def test_more_than_memory(monkeypatch):
     scene, env = task_scene("hopper"), diffsim.make("hopper", num_envs=2, horizon=2000, substeps=10**6)
     monkeypatch.setattr(torch, "zeros", None)  # nothing is allocated
     for make in (partial(diffsim.make, "hopper"), partial(diffsim.Simulator, scene)):
-        with pytest.raises(ValueError, match="100,000,000,000: the states and actions would take .* GiB, but cpu has"):
+        with pytest.raises(
+            ValueError,
+            match="100,000,000,000: the states and actions of a horizon of .* steps would take .* GiB, but cpu has",
+        ):
             make(num_envs=10**11)
     with pytest.raises(ValueError, match="num_envs is 2: the checkpoints would take .* GiB, .* enough for 0 environ"):
         env.step(torch.full((2, 3), 0.0, requires_grad=True))

@@ -72,7 +72,7 @@ def test_own_learner() -> None:
     """The page shows the loop of the file; the pole swings up."""
     page, file = (ROOT / "docs" / "own_learner.md").read_text(), (EXAMPLES / "own_learner.py").read_text()
     listing, critic = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    assert listing in file and len(page.split()) <= 500
+    assert listing in file
     returns = load("own_learner").train()
     assert np.mean(returns[:3]) < -1500 and np.mean(returns[-3:]) > -800
     env = diffsim.make("hopper", 4, horizon=8)
@@ -80,6 +80,26 @@ def test_own_learner() -> None:
     policy, value = (torch.nn.Linear(11, width) for width in (3, 1))
     exec(critic, {"torch": torch, "env": env, "policy": policy, "critic": value})
     assert all(part.grad.norm() > 0 for part in policy.parameters())
+
+
+def test_push() -> None:
+    """The box does not depend on an action that does not reach it; pushed hard enough it moves, with a gradient."""
+    env = diffsim.make(load("push").Push, 2, horizon=16, stochastic_init=False, dtype=torch.float64)
+    env.reset(seed=1)
+    qpos, qvel = env.qpos.clone(), env.qvel.clone()
+    for gap, force, moves in ((0.2, 0.5, False), (0.0, 0.0625, False), (0.0, 0.5, True)):  # m, 20 N; it sticks to 2.5 N
+        start = qpos.clone()
+        start[:, 0] = qpos[:, 2] - 0.08 - 0.05 + 1e-4 - gap
+        env.set_state(start, qvel)
+        env.detach()
+        action = torch.zeros(2, 2, dtype=torch.float64)
+        action[:, 0] = force
+        action.requires_grad_()
+        for _ in range(4):
+            obs, *_ = env.step(action)
+        (gradient,) = torch.autograd.grad(obs[:, 0].sum(), action)
+        moved = float((env.qpos[0, 2] - start[0, 2]).detach())
+        assert (moved > 2e-3) == moves and (float(gradient[0, 0]) > 2e-3) == moves, (gap, force, moved, gradient)
 
 
 @pytest.mark.parametrize("names, only", [(("mass", "damping", "armature"), ()), (("friction",), ("floor",))])

@@ -18,11 +18,12 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.planning import LinearGaussian, System, save_demonstration
+from diffsim.planning.policy import GaussianPolicy
 from diffsim.training import Evaluation, evaluate, load_policy, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from diffsim_cli.watch import make_policy_env
-from gps import log_mixture, phi, sparse
+from gps import phi
 
 SMALL = (
     "--env cartpole --horizon 30 --pretraining 40 --hidden 8 --guiding-samples 8 --samples 4 --active 16 "
@@ -42,8 +43,7 @@ def make_search(env: str, flags: str = "") -> gps.Search:
 # Importance sampling
 
 
-def a_policy(rng: np.random.Generator, env: str = "cartpole") -> tuple[gps.Policy, Tensor]:
-    policy = make_search(env, "--demonstration none.npz --hidden 5").network
+def randomise(policy: GaussianPolicy, rng: np.random.Generator) -> tuple[GaussianPolicy, Tensor]:
     nu, inputs = len(policy.sigma), len(policy.observed)
     policy.obs_mean, policy.obs_std = normal(rng, inputs), 1 + normal(rng, inputs).abs()
     policy.u_std, policy.sigma = torch.full((nu,), 2.0).double(), torch.full((nu,), 0.5).double()
@@ -58,11 +58,11 @@ def a_set(rng: np.random.Generator, m: int = 15, T: int = 9, n: int = 3) -> tupl
 @pytest.mark.parametrize("w_r", [0.0, 1e-2, 3.0])
 def test_gradient_of_phi_is_that_of_appendix_a(w_r: float, rng: np.random.Generator) -> None:
     """And of central differences."""
-    policy, theta = a_policy(rng, "hopper")
+    policy, theta = randomise(make_search("hopper", "--hidden 5").network, rng)
     obs, u, reward, log_q = a_set(rng)
     u = policy.mean(theta, obs) + 0.6 * u  # likely enough under the policy that no product underflows
     sources = torch.arange(len(u)) % log_q.shape[1]
-    mixture = log_mixture(gps.Samples(obs, obs, u, reward, sources, log_q))
+    mixture = gps.Samples(obs, obs, u, reward, sources, log_q).log_mixture
 
     def objective(theta: Tensor) -> Tensor:
         return phi(policy.log_prob(theta, obs, u), mixture, reward, w_r)
@@ -80,7 +80,7 @@ def test_gradient_of_phi_is_that_of_appendix_a(w_r: float, rng: np.random.Genera
     assert (gradient - appendix).norm() / appendix.norm() < 1e-10
 
     S = gps.Samples(obs, obs, u, reward, sources, log_q)
-    value = sparse(lambda log_pi: phi(log_pi, mixture, reward, w_r), policy, leaf, S)
+    value = policy.sparse(lambda log_pi: phi(log_pi, mixture, reward, w_r), leaf, S)
     torch.testing.assert_close(value.detach(), objective(theta), rtol=1e-14, atol=0)
     torch.testing.assert_close(torch.autograd.grad(value, leaf)[0], gradient, rtol=1e-10, atol=1e-13)
 
@@ -98,7 +98,7 @@ def test_mixture_is_of_prefixes() -> None:
     expected = [[math.log((math.exp(a) + math.exp(b)) / 2) for a, b in ((0, -20), (-20, -20), (-20, -40))]] * 2
     nothing = per_step[:, :, :0]  # none of the samples comes from the distribution between the two
     S = gps.Samples(nothing, nothing, nothing, nothing, torch.tensor([2, 0]), per_step.cumsum(2))
-    torch.testing.assert_close(log_mixture(S), torch.tensor(expected, dtype=torch.float64))
+    torch.testing.assert_close(S.log_mixture, torch.tensor(expected, dtype=torch.float64))
 
 
 # The search
@@ -136,24 +136,25 @@ def test_reward_of_the_paper(monkeypatch: pytest.MonkeyPatch) -> None:
     x[1], x[2], x[6] = 0.1, 0.2, 2.0
     u = torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64)
     expected = -(0.01 * 5.25 + 0.5**2 + 10 * (1.25 + 0.1 - 1.2) ** 2 + 0.2**2)
-    assert search.reward(x, u).item() == pytest.approx(expected)
+    assert search.rollouts.reward(x, u).item() == pytest.approx(expected)
     search = make_search("ant", "--demonstration none.npz --action-cost 0.01")
     x, u = search.system.start()[0], torch.ones(8, dtype=torch.float64)
     x[15], turn = 3.0, 4 * x[4:7].square().sum().item()
     expected = -(0.01 * 8 + 2.0**2 + 10 * (x[2].item() - 0.5) ** 2 + 0.1 * turn)
-    assert search.reward(x, u).item() == pytest.approx(expected)
+    assert search.rollouts.reward(x, u).item() == pytest.approx(expected)
     native = make_search("cartpole", "--action-cost 0.01")
     x, u = native.system.start(), torch.ones(1, 1, dtype=torch.float64)
-    torch.testing.assert_close(native.reward(x, u), native.system.reward(x, u) - 0.01)
+    torch.testing.assert_close(native.rollouts.reward(x, u), native.system.reward(x, u) - 0.01)
 
 
 def test_policy_does_not_look_at_the_action_before(rng: np.random.Generator) -> None:
-    policy, theta = a_policy(rng, "ant")
+    search = make_search("ant", "--demonstration none.npz --hidden 5")
+    policy, theta = randomise(search.network, rng)
     policy.obs_mean[29:] = 0.0  # as in all that it is fitted to
     obs = normal(rng, 4, 37)
     other = obs.clone()
     other[:, 29:] += 1.0
-    network = policy.deterministic()
+    network = search.policy
     assert torch.equal(network(other), network(obs))
     obs[:, 29:] = 0.0
     torch.testing.assert_close(network(obs), policy.mean(theta, obs).tanh())
@@ -178,16 +179,46 @@ def test_schedule_of_the_regulariser(
 
     monkeypatch.setattr(search, "estimate", estimate)
     for better in (True, True, True, False, False, False, False, False, False, True):
-        metrics, drawn = search.iterate(1), search.control_steps
+        metrics, drawn = search.iterate(1), search.rollouts.control_steps
         assert metrics["gps/accepted"] == better and (compared[-1] or not better)
         assert metrics["gps/regularizer"] == pytest.approx(seen[-1] if seen else start)
         best = best + 1e-3 if better else best
         torch.testing.assert_close(search.network.theta, best)
         torch.testing.assert_close(search.S.generators[search.best], (best,))
         seen.append(search.w_r)
-    assert drawn == search.control_steps
+    assert drawn == search.rollouts.control_steps
     expected = [1e-5, 1e-6, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-2, 1e-2, 1e-3]
     np.testing.assert_allclose(seen, expected if start else 0.0)
+
+
+@pytest.mark.parametrize("lasts", [True, False])
+def test_a_better_policy_lasts_beyond_the_horizon(
+    lasts: bool, search: gps.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With --beyond 3: what is better by Eq. 2 is refused if its return over three horizons is lower."""
+    search.args.beyond, best = 3, search.network.theta
+    monkeypatch.setattr(search, "optimise", lambda S: (best + 1e-3, {}))
+    monkeypatch.setattr(search, "estimate", lambda theta, active: (True, {}))
+    monkeypatch.setattr(search.rollouts, "endurance", lambda theta: float(torch.equal(theta, best) != lasts))
+    assert search.iterate(1)["gps/accepted"] == lasts
+    assert torch.equal(search.network.theta, best) != lasts
+
+
+def test_endurance_is_the_return_of_longer_and_noisier_trajectories(
+    search: gps.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 3 horizons with 3 times the noise, the same each time; the search's own random numbers are left alone."""
+    search.args.beyond, rollouts, seen = 3, search.rollouts, list[Tensor]()
+    roll_out, state = rollouts.roll_out, rollouts.rng.get_state()
+
+    def watch(theta: Tensor, noise: Tensor, start: Tensor) -> gps.Samples:
+        seen.append(noise)
+        return roll_out(theta, noise, start)
+
+    monkeypatch.setattr(rollouts, "roll_out", watch)
+    first, again = (rollouts.endurance(search.network.theta) for _ in range(2))
+    assert first == again and torch.equal(*seen) and seen[0].shape == (4, 90, 1)
+    assert 2.5 < seen[0].std() < 3.5 and torch.equal(rollouts.rng.get_state(), state)
 
 
 def test_guides_reproduce_the_plan(rows: list[dict[str, str]]) -> None:
@@ -199,15 +230,15 @@ def test_guides_reproduce_the_plan(rows: list[dict[str, str]]) -> None:
 def test_a_diverged_step_earns_a_floor_below_all_of_the_guides(search: gps.Search) -> None:
     """As far below their worst step as that one is below the best."""
     worst, top = search.sample_guides().reward.aminmax()
-    assert search.floor == pytest.approx((2 * worst - top).item()) and worst < top
+    assert search.rollouts.floor == pytest.approx((2 * worst - top).item()) and worst < top
     x, finite = search.guides[0].x[None], torch.arange(30)[None] < 20
-    reward = search.measure(x, search.guides[0].u[None], finite).reward
-    assert ((reward == search.floor) == ~finite).all()
+    reward = search.rollouts.measure(x, search.guides[0].u[None], finite).reward
+    assert ((reward == search.rollouts.floor) == ~finite).all()
 
 
 def test_line_7_ends_above_both_of_its_starts(search: gps.Search) -> None:
     S, theta = search.S.samples.pick(search.choose(16, 4)), search.network.theta
-    value, top = search.objective(log_mixture(S), S.reward / search.scale), S.returns.argmax()
+    value, top = search.objective(S.log_mixture, S.reward / search.scale), S.returns.argmax()
     fitted = search.network.fit(theta, S.obs[top], S.u[top], search.args.lbfgs_iterations)
     end, metrics = search.optimise(S)
     before, imitated, after = (value(search.network.log_prob(t, S.obs, S.u)).item() for t in (theta, fitted, end))
@@ -218,7 +249,7 @@ def test_line_7_ends_above_both_of_its_starts(search: gps.Search) -> None:
 def test_active_set(search: gps.Search) -> None:
     """All guiding samples, the newest of the best policy, and a planted sample of high weight."""
     other = search.network.theta + 0.01
-    planted = int(search.S.append(search.draw(other, len(search.S.generators)), (other,))[-1])
+    planted = int(search.S.append(search.rollouts.draw(other, len(search.S.generators)), (other,))[-1])
     S = search.S.samples
     log_q = S.log_q.clone()
     log_q[planted] -= 1e3
@@ -233,7 +264,10 @@ def test_adapted_guides_leave_room_for_the_best_policys_own_samples(search: gps.
     adapted = search.guides[0]._replace(u=search.guides[0].u + 0.1)
     S = search.S
     for _ in range(3):
-        S.append(search.measure(*adapted.sample(search.system, search.noise(6)), len(S.generators)), adapted)
+        S.append(
+            search.rollouts.measure(*adapted.sample(search.system, search.rollouts.noise(6)), len(S.generators)),
+            adapted,
+        )
     source, chosen = S.samples.source, set(search.choose(16, 4).tolist())
     own = (source == search.best).nonzero().flatten()[-4:]
     assert {*own.tolist(), *(source == 0).nonzero().flatten().tolist()} <= chosen
@@ -270,7 +304,7 @@ def test_rows_and_files_of_a_run(trained: Path, rows: list[dict[str, str]]) -> N
     arguments = json.loads((trained / "args.json").read_text())
     assert arguments["hidden"] == 8 and arguments["action_cost"] == 1e-3
     steps = [int(row["control_steps"]) for row in rows]
-    assert steps[0] == 30 * (8 + 4)  # guiding samples and the policy's own
+    assert steps[0] == 30 * (8 + 8 + 4)  # guiding samples, lessons and the policy's own
     # Before a proposal is accepted, as many as of the guides are drawn; a rejection draws the best policy's again.
     for drawn, row in zip(np.diff(steps) // 30, rows[1:], strict=True):
         assert drawn in ((4 + 8,) if row["gps_accepted"] == "1.0" else (4 + 4, 4 + 8 + 4))
@@ -298,7 +332,7 @@ def test_evaluation(
 def test_the_policy_acts_in_environments_as_it_does_in_the_search(trained: Path, search: gps.Search) -> None:
     env = diffsim.make("cartpole", 2, horizon=1, dtype=torch.float64, stochastic_init=False)
     env.episode_length = 30
-    S = search.roll_out(search.network.theta, 0 * search.noise(1), search.guides[0].x[:1])
+    S = search.rollouts.roll_out(search.network.theta, 0 * search.rollouts.noise(1), search.guides[0].x[:1])
     returns = search.system.reward(S.x[:, 1:], S.u).sum(1).expand(2)
     torch.testing.assert_close(evaluate(env, search.policy).returns, returns)
     torch.testing.assert_close(
@@ -314,7 +348,7 @@ def test_a_gpu_learns_as_the_cpu_does(tmp_path: Path) -> None:
     for part in ("x", "u", "K", "L"):
         place = LinearGaussian._fields.index(part)
         torch.testing.assert_close(other["learner"]["guides"][0][place].cpu(), one["learner"]["guides"][0][place])
-    assert other["learner"]["control_steps"] == one["learner"]["control_steps"]
+    assert other["rollouts"]["control_steps"] == one["rollouts"]["control_steps"]
     torch.testing.assert_close(other["network"]["theta"].cpu(), one["network"]["theta"], rtol=1e-3, atol=1e-3)
 
 
@@ -352,13 +386,71 @@ def test_an_example_is_where_the_guides_start(tmp_path: Path) -> None:
     assert search["guides"][0][0][0].tolist() == [0.3, 3.0, 0.0, 0.0]
 
 
-def test_the_noise_of_guides_is_at_most_the_policys() -> None:
-    """exp(reward) and the tracking of states make it smaller."""
-    search = make_search("hopper", "--horizon 20")
+@pytest.fixture(scope="module")
+def walker() -> gps.Search:
+    """A search that has its guides."""
+    search = make_search("walker", "--horizon 60 --pretraining 1 --seed 1")
     search.prepare(lambda message: None)
-    assert search.scale == pytest.approx(search.S.samples.reward.std().item())
-    for covariance in search.guides[0].L @ search.guides[0].L.mT:
-        assert (torch.linalg.eigvalsh(search.network.sigma.square().diag() - covariance) > 0).all()
+    return search
+
+
+def test_guides_are_as_wide_as_the_policy(walker: gps.Search) -> None:
+    (guide,), sigma = walker.guides, walker.network.sigma
+    assert (guide.L.square().sum(-1) / sigma.square()).mean().item() == pytest.approx(1.0)
+    assert walker.scale == pytest.approx(walker.S.samples.reward.std().item())
+
+
+def test_feedback_of_guides_does_not_depend_on_the_policys_noise(walker: gps.Search) -> None:
+    """Only their width does."""
+    quiet = make_search("walker", "--horizon 60 --pretraining 1 --noise 0.05")
+    quiet.prepare(lambda message: None)
+    torch.testing.assert_close(quiet.guides[0].K, walker.guides[0].K)
+    torch.testing.assert_close(quiet.guides[0].L, 0.5 * walker.guides[0].L)
+
+
+def test_guides_correct_what_the_example_alone_does_not(walker: gps.Search) -> None:
+    """Noise that makes the robot leave the example without feedback stays near it with feedback."""
+    (guide,), system = walker.guides, walker.system
+    noise = 3.0 * walker.rollouts.noise(8, torch.Generator().manual_seed(1))
+    away = [
+        system.difference(controller.sample(system, noise)[0][:, -1], guide.x[-1]).norm(dim=-1).median().item()
+        for controller in (guide, guide._replace(K=0.0 * guide.K))
+    ]
+    assert away[0] < 0.7 * away[1]
+
+
+def test_lessons_of_line_3_are_the_feedback_of_wide_guides(walker: gps.Search) -> None:
+    """At each step they differ between samples, and the more so, the wider the samples are."""
+    spreads = {}
+    for noise in (0.5, 0.1):
+        walker.args.pretraining_noise = noise
+        obs, u = walker.lessons()
+        assert obs.shape[0] == u.shape[0] == 40 * 60
+        spreads[noise] = torch.stack([part.view(40, 60, -1)[:, 10:].std(0).norm() for part in (obs, u)])
+    assert (spreads[0.1] > 0).all() and (spreads[0.5] / spreads[0.1] > 4).all()
+
+
+def test_line_3_has_no_lessons_after_a_fall(walker: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of least reward, and all later ones of its trajectory, are left out."""
+    follow = walker.rollouts.follow
+
+    def fall(*arguments: Any) -> gps.Samples:
+        S = follow(*arguments)
+        S.reward[1, 20] = S.reward[3, 0] = walker.rollouts.floor
+        return S
+
+    monkeypatch.setattr(walker.rollouts, "follow", fall)
+    assert len(walker.lessons()[0]) == 38 * 60 + 20
+
+
+def test_imitation_finds_a_network_again(rng: np.random.Generator) -> None:
+    """Not the weights, but the means where it was fitted."""
+    policy, theta = randomise(make_search("hopper", "--hidden 5").network, rng)
+    obs = policy.obs_mean + policy.obs_std * normal(rng, 1024, len(policy.observed))
+    u = policy.mean(theta, obs)
+    policy.standardise(obs, u)
+    found = policy.imitate(obs, u, 200, torch.Generator().manual_seed(1))
+    assert ((policy.mean(found, obs) - u) / policy.u_std).square().mean() < 0.15
 
 
 def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:

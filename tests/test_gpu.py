@@ -21,7 +21,7 @@ from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.thread.division import divide
 from diffsim.kernels.thread.spec import kernel_spec
 from diffsim.kernels.thread.wide import module_options
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS
 from diffsim.sim import simulator
@@ -109,7 +109,7 @@ def episode(
     weights = [torch.randn(n, width, generator=generator, **kwargs) for width in (start.scene.nq, start.scene.nv)]
     parts = [start.qpos, start.qvel, actions]
     if integration:
-        parts.append(torch.rand(n, len(FACTORS), generator=generator, **kwargs) + 0.5)
+        factors = torch.rand(n, len(FACTORS), generator=generator, **kwargs) + 0.5
         parts.append(torch.randn(n, start.scene.nbody, 6, generator=generator, **kwargs))
     inputs = [x.to(device).detach().requires_grad_() for x in parts]
     scene = start.scene
@@ -118,8 +118,9 @@ def episode(
     kwargs |= dict(device=device, division=team, **dict.fromkeys(("factors", "forces"), integration is not None))
     sim = Simulator(scene, n, integration or start.sim.integration, start.control_dt, HORIZON, **kwargs)
     qpos, qvel, steps, *optional = inputs
-    if optional:
-        sim.factors, sim.forces = optional
+    if integration:
+        (sim.forces,) = optional
+        sim.factors = factors.to(device)
     for action in steps:
         qpos, qvel = sim.step(qpos, qvel, action)
     assert not sim.nonfinite.any()
@@ -137,7 +138,7 @@ def episode(
     + [("ant", Integration("mujoco", 4, tolerance=1e-12))],
 )
 def test_gpu_agrees_with_cpu(name: str, integration: Integration | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without factors, forces and terrain, and with them and the gradient in the first two."""
+    """Without factors, forces and terrain, and with them and the gradient in forces."""
     monkeypatch.setattr(simulator, "PASSES", 60)
     reference = episode(name, "cpu", integration=integration)
     for team in [(1, 1), (2, 1), (4, 1), (8, 4)]:

@@ -31,7 +31,6 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 ONE = Integration(substeps=1)
-STEPS = {"factors": 1e-5, "forces": 1e-2}  # of differences
 
 
 def weights(scene, rng):
@@ -46,12 +45,13 @@ def measure(qpos, qvel, weights):
 
 
 def gradients(scene, states, weights, dtype=torch.float64, optional=None, **simulator):
-    """Of the measure after one control step with respect to qpos, qvel, ctrl and what is optional, by their names."""
-    optional = optional or {}
-    leaves = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in (*states, *optional.values())]
+    """Of the measure after one control step with respect to qpos, qvel, ctrl and optional forces, given any factors."""
+    optional = {name: torch.tensor(x, dtype=dtype) for name, x in (optional or {}).items()}
+    leaves = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in states]
+    leaves += [optional["forces"].requires_grad_()] if "forces" in optional else []
     sim = Simulator(scene, len(states[0]), dtype=dtype, **dict.fromkeys(optional, True), **simulator)
-    for name, leaf in zip(optional, leaves[3:], strict=True):
-        setattr(sim, name, leaf)
+    for name, value in optional.items():
+        setattr(sim, name, value)
     q, v = sim.step(*leaves[:3])
     measure(q, v, weights).sum().backward()
     return [leaf.grad.double().numpy() for leaf in leaves]
@@ -59,14 +59,17 @@ def gradients(scene, states, weights, dtype=torch.float64, optional=None, **simu
 
 def differences(scene, states, weights, optional=None, scale=1.0, **simulator):
     """The same by central differences of fourth order, all in one batch; small steps, as contacts make corners."""
-    optional, steps = optional or {}, (1e-7 * scale, 1e-6 * scale, 1e-5 * scale, *map(STEPS.get, optional or {}))
-    rows, states = len(states[0]), [*states, *(x.reshape(len(x), -1) for x in optional.values())]
+    optional, rows = optional or {}, len(states[0])
+    states = [*states, *(x.reshape(rows, -1) for name, x in optional.items() if name == "forces")]
     sizes = [x.shape[1] for x in states]
+    steps = (1e-7 * scale, 1e-6 * scale, 1e-5 * scale, 1e-2)[: len(sizes)]
     eps, splits = np.repeat(steps, sizes), np.cumsum(sizes)[:-1]
     offsets = np.array([-2.0, -1.0, 1.0, 2.0])[:, None, None, None] * np.diag(eps)[:, None, :]
     batch = (np.concatenate(states, 1) + offsets).reshape(-1, sum(sizes))
     parts = np.split(batch, splits, axis=1)
-    given = {name: x.reshape(-1, *of.shape[1:]) for (name, of), x in zip(optional.items(), parts[3:], strict=True)}
+    given = {name: np.tile(x, (4 * sum(sizes), *[1] * (x.ndim - 1))) for name, x in optional.items()}
+    if "forces" in given:
+        given["forces"] = parts[3].reshape(given["forces"].shape)
     values = measure(*run(scene, *parts[:3], **given, **simulator), weights)
     far_low, low, high, far_high = values.reshape(4, sum(sizes), rows)
     slopes = (8 * (high - low) - (far_high - far_low)) / 12
@@ -76,11 +79,10 @@ def differences(scene, states, weights, optional=None, scale=1.0, **simulator):
 def check_gradients(scene, states, rng, optional=None, **simulator):
     w = weights(scene, rng)
     values, expected = (f(scene, states, w, optional=optional, **simulator) for f in (gradients, differences))
-    for name, value, slope in zip(("qpos", "qvel", "ctrl", *(optional or ())), values, expected, strict=True):
+    for name, value, slope in zip(("qpos", "qvel", "ctrl", "forces"), values, expected, strict=False):
         value = value.reshape(slope.shape)
         if slope.size:
-            axis = 0 if name == "factors" else -1  # a factor weighs as much as any other, however little it moves
-            error, size = np.linalg.norm(value - slope, axis=axis), np.linalg.norm(slope, axis=axis)
+            error, size = np.linalg.norm(value - slope, axis=-1), np.linalg.norm(slope, axis=-1)
             assert (error <= 1e-6 * size).all() and size.any(), f"gradient with respect to {name}"
 
 
@@ -127,9 +129,10 @@ def test_gradient_of_small_robots_is_that_of_differences(name, rng):
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))
 
 
+@pytest.mark.unoptimized
 @pytest.mark.parametrize("implicit", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_gradient_of_bounded_servos_is_that_of_differences(implicit, rng):
-    """At a bound the force depends on nothing; of the factors, it knows the motors' and the mass."""
+    """At a bound the force depends on nothing; also with factors of motors and mass."""
     scene, factors = parse(BOUNDED_SERVOS), {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))}
     check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=Integration("soft", 8, implicit))
 
@@ -143,7 +146,7 @@ def test_gradient_of_bounded_servos_is_that_of_differences(implicit, rng):
     ],
 )
 def test_gradient_under_gravity_compensation_is_that_of_differences(integration, rng):
-    """And in the factor of mass."""
+    """Also with factors of mass."""
     scene = parse(COMPENSATED)
     factors = {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))} if integration.contact == "soft" else None
     check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=integration)

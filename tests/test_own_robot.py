@@ -42,7 +42,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(ROOT / "examples" / f"own_robot.{suffix}", folder / "examples")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        (words,) = (words for words in COMMANDS if words[0] == LEARNER and "--env" in words)
+        words = next(words for words in COMMANDS if words[:3] == [LEARNER, "--env", "examples/own_robot.py"])
         ppo_baseline.main([*small(words), *TINY])
     return folder
 
@@ -63,6 +63,7 @@ def test_the_page_lists_the_example() -> None:
         "install",
         "-m",
         "examples/own_quadruped.py",
+        "ppo_baseline.py",  # the task with an object
     ]
 
 
@@ -141,7 +142,7 @@ def test_a_robot_of_menagerie_and_its_onnx(tmp_path: Path, monkeypatch: pytest.M
     shutil.copy(ASSETS / "stage.xml", folder)
     monkeypatch.chdir(tmp_path)
     file = str(ROOT / "examples" / "own_quadruped.py")
-    _, train, _, export, play = COMMANDS[5:]
+    _, train, _, export, play = COMMANDS[5:10]
     assert train[2] == export[-1] == f"{Path(file).parent.name}/{Path(file).name}" == play[0]
     tiny = "--iterations 1 --num-envs 4 --horizon 4 --run-dir run".split()
     shac.main(["--env", file, *tiny, *FEW])

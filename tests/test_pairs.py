@@ -13,14 +13,14 @@ import pytest
 import test_constraint
 import torch
 from scenes import free_states, parse, pendulum, random_tree, robot
-from test_constraint import CONES, STATES, H, check_gradients, check_neighbours, in_mujoco, mujoco_model, step
-from test_gradient import gradients, weights
+from test_constraint import CONES, STATES, H, check_gradients, in_mujoco, mujoco_model, step
 
 from diffsim.robot import pairs as robot_pairs
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.robot.pairs import with_pairs
-from diffsim.robot.scene import FACTORS, SceneError
+from diffsim.robot.scene import FACTORS
 from diffsim.robot.shapes import as_primitives
+from diffsim.robot.types import SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim_cli.report import approximations, report
@@ -118,37 +118,6 @@ def linkages(rng):
     scene = parse(FOUR_BAR)
     qpos, qvel = 0.03 * rng.normal(size=(9, scene.nq)), 0.1 * rng.normal(size=(9, scene.nv))
     return scene, (qpos, qvel, rng.uniform(-1, 1, (9, 2)))
-
-
-@pytest.mark.unoptimized
-@pytest.mark.parametrize(
-    "name, block", [("four-bar", 8), *(pytest.param("tree", block, marks=SLOW) for block in (1, 8))]
-)
-def test_single_precision_is_near(name, block, rng):
-    scene, states = (
-        linkages(rng) if name == "four-bar" else ((tree := tied_tree("floating", 0)), tied_states(tree, 9, rng))
-    )
-    w = weights(scene, rng)
-    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=block)
-    assert residual.max() < 1e-4
-    expected = step(scene, states, 4)[1]
-    assert abs(qvel - expected).max() < 1e-4 * abs(expected).max()
-    found, exact = (
-        np.concatenate(gradients(scene, states, w, dtype, control_dt=4 * H, integration=how, block=size), axis=1)
-        for dtype, how, size in (
-            (torch.float32, Integration("mujoco", 4), block),
-            (torch.float64, Integration("mujoco", 4, tolerance=1e-11), 1),
-        )
-    )
-    assert np.linalg.norm(found - exact) < 1e-2 * np.linalg.norm(exact)
-
-
-@pytest.mark.unoptimized
-def test_neighbours_do_not_change_an_environment(rng):
-    scene, states = linkages(rng)
-    states = [x[:8] for x in states]
-    states[1][::2] *= 100.0
-    check_neighbours(scene, states)
 
 
 @pytest.mark.unoptimized
@@ -511,17 +480,6 @@ def test_gradient_through_several_contacts_is_that_of_differences(cone, rng):
         check_gradients_of_touching(scene, states, rng)
 
 
-@SLOW
-def test_several_contacts_in_single_precision_are_near(rng):
-    scene = solids("elliptic", 0)
-    states = solid_states(scene, 64, rng)
-    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=8)
-    expected = step(scene, states, 4)[1]
-    assert residual.max() < 1e-4 and np.median(abs(qvel - expected).max(1) / abs(expected).max(1)) < 1e-4
-    for k in range(0, 64, 8):
-        check_neighbours(scene, [x[k : k + 8] for x in states])
-
-
 PLATE = 'type="box" size=".2 .1 .05"'
 # Shapes on a plate of that size, at the height where they touch it, exactly along one of its sides or ends
 FLUSH = {
@@ -631,16 +589,6 @@ def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
         expected = step(alone, [x[k : k + 1] for x in states])[1]
         np.testing.assert_allclose(qvel[k], expected[0], rtol=1e-8, atol=1e-8)
     assert any(each[0] != max(each) for each in touching if len(each) > 2)
-
-
-@SLOW
-def test_contact_in_single_precision_is_near(rng):
-    """An environment whose parts touch leaves one beside it alone whose parts do not."""
-    scene, states = tangled("floating", "elliptic", 0, 9, rng)
-    _, qvel, residual = step(scene, states, 4, 1e-4, dtype=torch.float32, block=8)
-    expected = step(scene, states, 4)[1]
-    assert residual.max() < 1e-4 and abs(qvel - expected).max() < 1e-3 * abs(expected).max()
-    check_neighbours(scene, [x[:8] for x in states])
 
 
 @pytest.mark.gpu

@@ -31,7 +31,8 @@ from torch import Tensor
 
 from diffsim.parameters import FIELDS, ParametricSimulator
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Scene, SceneError
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import SceneError
 from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -172,6 +173,7 @@ def tensors(values: Values, **options: Any) -> dict[str, Tensor]:
 def test_gradients_are_those_of_rebuilt_models(name: str, rng: np.random.Generator) -> None:
     """Along random directions in each parameter."""
     sim, scene, states = parametric(name)
+    assert sim._robot.count == sim._launcher.spec.columns.end
     values, w = other_values(sim, rng), weights(scene, rng)
     sim.parameters = leaves = tensors(values, requires_grad=True)
     start = [torch.tensor(x) for x in states]

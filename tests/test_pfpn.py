@@ -91,7 +91,7 @@ def test_bins_count_as_the_nearest() -> None:
 @pytest.mark.parametrize("std", ["state", "own"])
 def test_the_deviation_of_a_gaussian_depends_on_the_state_or_not(std: str) -> None:
     args = parse(pfpn.Args, f"--device cpu --policy gaussian --std {std}".split())
-    own, features = pfpn.Head(args, 4, M), torch.randn(20, 4)
+    own, features = pfpn.HEADS[args.policy](args, 4, M), torch.randn(20, 4)
     before = own(features).log_std.detach().clone()
     assert before.abs().max() < 0.2
     mixture = own(features[:1])
@@ -108,7 +108,7 @@ def test_the_deviation_of_a_gaussian_depends_on_the_state_or_not(std: str) -> No
 def test_the_first_actions_have_the_deviation_that_is_asked_for(policy: str, log_std: float) -> None:
     args = parse(pfpn.Args, f"--device cpu --policy {policy} --initial-log-std {log_std}".split())
     torch.manual_seed(0)
-    draws = pfpn.Head(args, 4, M)(torch.zeros(20_000, 4)).sample()
+    draws = pfpn.HEADS[args.policy](args, 4, M)(torch.zeros(20_000, 4)).sample()
     torch.testing.assert_close(draws.std(0).log(), torch.full((M,), log_std), rtol=0, atol=0.15)
 
 
@@ -231,7 +231,7 @@ def head(*arguments: str, script: Any = pfpn) -> tuple[Any, Any, ClippedAdam, Te
     flags = "--env ant --device cpu --particles 6 --resampling-interval 1 --resampling-noise 0"
     args = parse(script.Args, [*flags.split(), *arguments])
     torch.manual_seed(0)
-    own = script.Head(args, 4, M).double()
+    own = script.HEADS[args.policy](args, 4, M).double()
     with torch.no_grad():
         for parameter in own.parameters():
             parameter += 0.3 * torch.randn_like(parameter)

@@ -109,6 +109,31 @@ def test_ratio_and_divergence_are_those_of_the_distributions() -> None:
     torch.testing.assert_close(ppo.entropy(log_std), new.entropy()[0].sum())
 
 
+def test_means_beyond_the_bound_are_pulled_back_from_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where advantages, errors of the value and the bonus are zero, nothing else is left of the gradient."""
+    args = parse(ppo.Args, "--env ant --device cpu --hidden 16 --epochs 1 --entropy-coef 0".split())
+    learner, seen = ppo.PPO(args, diffsim.make("ant", num_envs=1)), list[torch.Tensor]()
+    monkeypatch.setattr(learner, "minibatches", 1)
+    (layer,) = learner.actor_critic.mean
+    excess = torch.tensor([0.5, -0.5, 0.25, -0.25])
+    means = torch.cat((excess + excess.sign() * ppo.BOUND, torch.tensor([ppo.BOUND - 0.1, 0.1 - ppo.BOUND, 1.0, 0.0])))
+    with torch.no_grad():
+        layer.weight.zero_()
+        layer.bias.copy_(means)
+    obs = torch.randn(30, 37)
+    mean, value = learner.actor_critic(obs)
+    step, place = learner.optimizer.step, layer.bias.storage_offset()
+
+    def recorded(gradient: torch.Tensor) -> torch.Tensor:
+        seen.append(gradient[place : place + 8].clone())
+        return step(gradient)
+
+    monkeypatch.setattr(learner.optimizer, "step", recorded)
+    learner.learn(ppo.Batch(obs, mean.detach(), mean.detach(), torch.zeros(30), value.detach()))
+    expected = torch.cat((2 * ppo.BOUND_COEF * excess, torch.zeros(4)))  # of the squared excess
+    torch.testing.assert_close(seen, [expected], rtol=1e-5, atol=1e-10)
+
+
 def test_entropy_bonus_raises_the_noise(tmp_path: Path) -> None:
     """A wrong sign would lower it; the bonus is so large that nothing else counts."""
     arguments = "--env cartpole --iterations 2 --eval-episodes 4 --threads 1 --quiet --entropy-coef 100"

@@ -1,4 +1,4 @@
-"""The Python snippets of README and of the pages on gymnasium and physics run as they are printed."""
+"""The Python snippets of README and of the pages on the API, gymnasium and physics run as they are printed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from diffsim.tasks.base import ASSETS
 
 SNIPPETS = [
     pytest.param(code, id=f"{page.stem}-{k}")
-    for page in (ROOT / "README.md", ROOT / "docs" / "gymnasium.md", ROOT / "docs" / "physics.md")
+    for page in (ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("api", "gymnasium", "physics")))
     for k, code in enumerate(re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL))
 ]
 

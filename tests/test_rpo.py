@@ -39,6 +39,17 @@ def batch(samples: int = 40, actions: int = 3, dtype: torch.dtype = torch.float6
     return rpo.Batch(obs, mean, eps, gradient), torch.rand(actions, dtype=dtype) + 0.5
 
 
+@pytest.mark.parametrize("module", [rpo, shac])
+def test_a_task_may_ask_for_small_actions_at_first(module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its `initial_gain` multiplies the last weights; hidden layers and critic stay as they are."""
+    plain = build(module, "cartpole", *WIDTHS)
+    monkeypatch.setattr(diffsim.TASKS["cartpole"], "initial_gain", 0.25)
+    small = build(module, "cartpole", *WIDTHS)
+    last, hidden = ([learner.actor.mean[k] for learner in (small, plain)] for k in (-1, 0))
+    torch.testing.assert_close(last[0].weight, 0.25 * last[1].weight, rtol=0, atol=0)
+    assert not last[0].bias.any() and last[1].bias.all() and torch.equal(hidden[0].weight, hidden[1].weight)
+
+
 # One epoch of one minibatch -------------------------------------------------------------------------------------------
 
 

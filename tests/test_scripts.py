@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from diffsim.training import Run, graph
-from diffsim.training.directory import COLUMNS, column
+from diffsim.training.log import COLUMNS, column
 
 NOT_COMPARED = {"seconds"}
 PPO_LOSSES = " ".join(  # by CleanRL's names

@@ -13,8 +13,8 @@ from scenes import BALL, PENDULUM, acting_states, parse, run, task_scene, unit
 from test_gradient import check_gradients
 
 import diffsim
+from diffsim.robot.profile import TerrainError
 from diffsim.robot.scene import FACTORS, Scene
-from diffsim.robot.terrain import TerrainError
 from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -271,10 +271,7 @@ def test_environments_that_share_a_task_have_their_own_ground():
     for env, height in zip((first, *several), (0.3, 0.0, 0.0), strict=True):
         qpos = first.qpos[:1].repeat(env.num_envs, 1)
         seen = env.set_state(qpos, torch.zeros_like(first.qvel[:1]).repeat(env.num_envs, 1))
-        above = dict(zip(*zip(*env.task.obs_parts, strict=True), strict=True))
-        column = list(above).index("height")
-        column = sum(list(above.values())[:column])
-        torch.testing.assert_close(seen[:, column], qpos[:, 2] - height)
+        torch.testing.assert_close(env.task.named(seen)["height"][:, 0], qpos[:, 2] - height)
 
 
 # Generated profiles ---------------------------------------------------------------------------------------------------

@@ -1,37 +1,64 @@
-"""Write docs/api.md, the public names of diffsim, from their docstrings: python tools/api.py"""
+"""Write docs/api.md, the public names of diffsim, from their signatures and docstrings: python tools/api.py"""
 
 from __future__ import annotations
 
 import inspect
+import pkgutil
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import diffsim
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 HEAD = """# API
 
-`python tools/api.py` writes this page from docstrings; `help` prints all of them. N is the number of environments.
-`SceneError` and `TaskError` are `ValueError`s.
+Signatures with defaults, shapes, units, errors and an example of each public name. `python tools/api.py` writes this
+page from the code. N is the number of environments. `SceneError` and `TaskError` are `ValueError`s.
 """
-NAMES = "make DiffEnv Simulator Task".split()
-FULL = "step reset detach set_state jacobians".split()  # methods of DiffEnv and Simulator, printed with all they say
+NAMES = (
+    *(f"diffsim:{name}" for name in "make DiffEnv Task Task.load_robot load_scene".split()),
+    "diffsim.robot.pairs:with_pairs",
+    *(f"diffsim:{name}" for name in "Simulator Integration".split()),
+    "diffsim.sim.options:Options",
+    "diffsim.parameters:ParametricSimulator",
+    "diffsim.training:load_policy",
+    "diffsim_robots.terrain:rough",
+)
+FULL = "step reset detach set_state jacobians adjustable elements".split()  # methods printed with all they say
 # Methods that few programs need
 INTERNAL = """pin_rollout write_back take_statistics advance check_tensor tangent check load_robot scene bind presets
-integration falls has_mirror configured terrain stored restored over ghost disturb observe_with""".split()
+integration falls has_mirror configured terrain stored restored over ghost disturb observe_with restore""".split()
+SIDE = 100  # characters of a signature's line
+EXAMPLE = re.compile(r"Example:\n((?:\n|    .*(?:\n|\Z))+)")
 
 
 def signature(thing: object) -> str:
-    """The parameters without annotations and self, in lines of at most 100 characters."""
+    """The parameters without annotations and self, in lines of at most SIDE characters."""
     lines = [""]
     for each in inspect.signature(thing).parameters.values():  # type: ignore[arg-type]
         if each.name not in ("self", "cls", "unknown"):
             star = "*" * (each.kind == each.VAR_POSITIONAL) + "**" * (each.kind == each.VAR_KEYWORD)
             word = f"{star}{each.name}" + ("" if each.default is each.empty else f"={each.default!r}")
             joined = f"{lines[-1]}, {word}".removeprefix(", ")
-            lines = [*lines, word] if len(joined) > 100 else [*lines[:-1], joined]
+            lines = [*lines, word] if len(joined) > SIDE else [*lines[:-1], joined]
     return ",\n    ".join(lines)
+
+
+def called(name: str, thing: object) -> str:
+    """How a function or a class is called, as a block of text."""
+    return f"```text\n{name}({signature(thing)})\n```\n"
+
+
+def told(thing: object) -> Iterator[str]:
+    """The docstring as text, and its example, which tests run, as Python."""
+    doc = inspect.getdoc(thing) or ""
+    text = re.sub(r"\n{3,}", "\n\n", EXAMPLE.sub("", doc)).strip()
+    yield f"```text\n{text}\n```\n"
+    for example in EXAMPLE.findall(doc):
+        yield f"```python\n{textwrap.dedent(example).strip()}\n```\n"
 
 
 def members(kind: type) -> Iterator[str]:
@@ -49,20 +76,29 @@ def full(kind: type) -> list[str]:
     return [name for name in FULL if name in vars(kind)] if kind is not diffsim.Task else []
 
 
-def page() -> str:
-    """The text of the page. Classes have what help shows before and after their arguments."""
-    parts = [HEAD]
-    for name in NAMES:
-        thing, kind = getattr(diffsim, name), isinstance(getattr(diffsim, name), type)
-        doc = re.sub(r"\n\nExample:\n.*?(?=\n\n\w)", "", inspect.getdoc(thing) or "", flags=re.DOTALL)
-        doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
-        parts.append(f"## {name}\n\n```python\ndiffsim.{name}\n```\n\n```text\n{doc}\n```\n")
-        for method in full(thing) if isinstance(thing, type) else ():
+def entry(path: str) -> Iterator[str]:
+    """The parts of the page about one name."""
+    module, _, name = path.partition(":")
+    thing: Any = pkgutil.resolve_name(path)
+    yield f"## {name}\n"
+    yield called(f"{module}.{name}", thing)
+    yield from told(thing)
+    if isinstance(thing, type):
+        for method in full(thing):
             each = getattr(thing, method)
-            parts.append(f"### {name}.{method}({signature(each)})\n\n```text\n{inspect.getdoc(each)}\n```\n")
-        if kind and (rows := [*members(thing)]):
-            parts.append("\n".join(["| member | meaning |", "|---|---|", *rows]) + "\n")
-    return "\n".join(parts)
+            yield f"### {name}.{method}\n"
+            yield called(f"{name}.{method}", each)
+            yield from told(each)
+        if isinstance(parameters := vars(thing).get("parameters"), property):
+            yield f"### {name}.parameters\n"
+            yield from told(parameters)
+        if (rows := [*members(thing)]) and not issubclass(thing, tuple):
+            yield "\n".join(["| member | meaning |", "|---|---|", *rows]) + "\n"
+
+
+def page() -> str:
+    """The text of the page."""
+    return "\n".join([HEAD, *(part for path in NAMES for part in entry(path))])
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@
     python tools/draw.py batch diffsim/policies/go2.pt
     python tools/draw.py commands diffsim/policies/go2.pt
     python tools/draw.py learning ant --marks 5 15 60
+    python tools/draw.py searched runs/gps/humanoid__full__1
 
 A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own contact on the file of the robot, from
 the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
@@ -21,7 +22,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -63,6 +64,7 @@ FLOOR, AROUND = 4.0, 4.8  # m after which the floor repeats; s that a robot with
 DANCE = 12.6, 5.0  # s of the clip that a film of tracking begins with, and how many it shows
 LEAST_FPS, QUALITY = 25.0, 40  # of a film; WebP's, of 100
 SPACING = 1.5  # m between the robots of a batch
+NEAR = 0.9  # m, between the roots of two robots of a batch, at least
 # Seconds from which a film of commands has each one, as shares of the robot's largest, and what it is called
 COMMANDS = (
     (0.0, (0.0, 0.0, 0.0), "stand"),
@@ -266,7 +268,7 @@ def gait(
 
 
 def batch(
-    checkpoint: Positional[Path], count: int = 36, seconds: float = 4.0, size: tuple[int, int] = (640, 360)
+    checkpoint: Positional[Path], count: int = 9, seconds: float = 3.0, size: tuple[int, int] = (640, 360)
 ) -> None:
     """A film of many environments of one batch, each at its place of a grid, called <task>_batch.webp.
 
@@ -283,14 +285,15 @@ def batch(
     rows = np.stack(
         [episodes.episode(k)[0][round(1 / dt) :: every][: round(seconds / dt / every)] for k in range(count)]
     )
+    spacing = SPACING
+    while nearest(placed := apart(rows, side, spacing)) < NEAR:  # worlds are independent
+        spacing += 0.25
+    rows = placed
     model, _ = drawable(episodes.scene)
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     model.vis.map.shadowclip *= side  # the light sees all of them
     data, option, pert, camera = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.95 * side * SPACING
-    spread = SPACING * (np.arange(side) - (side - 1) / 2)
-    places = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2)
-    rows[:, :, :2] += places[:, None] - rows[:, :1, :2]  # each starts at its place
+    camera.lookat, camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.2), 60, -24, 0.8 * side * spacing
     frames = []
     with mujoco.Renderer(model, size[1], size[0], max_geom=model.ngeom * count + 100) as renderer:
         for moment in rows.swapaxes(0, 1):
@@ -305,6 +308,22 @@ def batch(
             frames.append(renderer.render())
     path = save_webp(FIGURES / f"{saved.args['env'].partition(':')[0]}_batch.webp", frames, 1 / (every * dt))
     print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
+
+
+def apart(rows: NDArray[Any], side: int, spacing: float) -> NDArray[Any]:
+    """Episodes qpos (n, T, nq), moved so that each starts at its place of a grid."""
+    spread = spacing * (np.arange(side) - (side - 1) / 2)
+    places = np.stack(np.meshgrid(spread, spread), -1).reshape(-1, 2)
+    moved = rows.copy()
+    moved[:, :, :2] += places[:, None] - rows[:, :1, :2]
+    return moved
+
+
+def nearest(rows: NDArray[Any]) -> float:
+    """The least distance [m] between the roots of two robots at the same time."""
+    x = rows[:, :, :2].swapaxes(0, 1)
+    gaps = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
+    return float((gaps + 1e9 * np.eye(len(rows))).min())
 
 
 def commands(checkpoint: Positional[Path], size: tuple[int, int] = (480, 320)) -> None:
@@ -395,6 +414,30 @@ def learning(
     print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
 
 
+def searched(checkpoint: Positional[Path], horizons: int = 3, size: tuple[int, int] = (360, 240)) -> None:
+    """A film of what gps.py has learned, with the noise of its policy, called gps_<task>.webp.
+
+    Args:
+        checkpoint: file or run of gps.py or benchmarks/guided_policy_search.py.
+        horizons: how long it is, in horizons of the search.
+        size: width and height in pixels.
+    """
+    from guided_policy_search import load_search
+
+    search = load_search(checkpoint)
+    rollouts, task, dt = search.rollouts, search.args.task, search.system.control_dt
+    noise = torch.cat([rollouts.noise(1, torch.Generator().manual_seed(k)) for k in range(horizons)], 1)
+    x = rollouts.roll_out(search.network.theta, noise, rollouts.start[:1]).x[0, :, : search.system.nq].numpy()
+    every, zoom = max(1, int(1 / (LEAST_FPS * dt) + 1e-6)), 2
+    with Renderer(search.system.scene, zoom * size[0], zoom * size[1]) as renderer:
+        frames = [
+            titled(halve(renderer.draw(qpos)), f"{k * every * dt:.0f} s, {qpos[0] - x[0, 0]:.0f} m")
+            for k, qpos in enumerate(x[::every])
+        ]
+    path = save_webp(FIGURES / f"gps_{task}.webp", frames, 1 / (every * dt))
+    print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
+
+
 def halve(frame: Frame) -> Frame:
     """2 x 2 pixels into one: smooth edges."""
     height, width = frame.shape[0] // 2, frame.shape[1] // 2
@@ -407,6 +450,7 @@ FILMS: dict[str, Callable[..., None]] = {
     "batch": batch,
     "commands": commands,
     "learning": learning,
+    "searched": searched,
 }
 
 

@@ -1,14 +1,10 @@
-"""Newton's method on MuJoCo's constraints: its iterate, its residual and its line search.
+"""Newton's method on MuJoCo's constraints.
 
 A pass of the articulated-body algorithm linearises the constraints' forces about the iterate: after the step s they are
-f - H s. The iterate is the solution if the true forces f(s) equal that. `evaluate_trial` returns the difference as an
-acceleration, the one by which the next step would correct it: (1 / w + H)^-1 (f - H s - f(s)), w the inverse weight.
+f - H s. The iterate is the solution if the true forces f(s) equal that (line_search.py).
 
 A pass solves for the step, not for its end: on stiff ground float32 rounds away the part of a whole acceleration on
 which the force depends. So jar and the links' accelerations are sums of steps, which become small.
-
-The cost that the solution minimises is convex, with the slope s.(f - H s - f(s)) after the step. Where the cost rises
-there, `line_search` shortens the step to where it is least.
 """
 
 from functools import cache
@@ -17,35 +13,31 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.laws.joint import joint_law
-from diffsim.kernels.mujoco.constraint import UNSOLVED, constraint_law, contact_room
+from diffsim.kernels.line_search import step_length
+from diffsim.kernels.mujoco.ground import contact_room, ground_contact
+from diffsim.kernels.mujoco.limits import joint_limits
 from diffsim.kernels.pairs.rows import pair_rows
+from diffsim.kernels.state import state_access
 from diffsim.kernels.thread.exchange import lane_sums
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
-
-MAX_EVALUATIONS = 12  # evaluations of a line search
-BRACKET_MARGIN = 0.1  # least distance of a secant step from the ends of the bracket, in multiples of its width
-COST_TOLERANCE = 0.1  # the line search ends this close to the least cost, in multiples of alpha times the first slope
-SLOPE_TOLERANCE = 0.05  # slope at which a whole step is accepted, in multiples of the first slope
-ROUND_OFF = 20.0  # error of a step, in multiples of the float's epsilon and of contact stiffness over inertia
-COUPLING = 10.0  # safety factor: rows couple, so the true error exceeds that of single rows by up to this (measured)
-FULL_STEP_PASSES = 6, 2  # passes, and with dry friction, that accept a whole step with a slope up to the first one
+from diffsim.kernels.transmission import transmission_law
+from diffsim.kernels.tree.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
 
 
 @cache
-def newton_method(spec: KernelSpec) -> SimpleNamespace:
-    t, sums, block, constraint = types(spec), lane_sums(spec), blocks(spec), constraint_law(spec)
-    T, vec3, vec4, vec6, Model, Lane, pick = t.T, t.vec3, t.vec4, t.vec6, t.Model, t.Lane, block.pick
+def newton_iterate(spec: KernelSpec) -> SimpleNamespace:
+    """Make the iterate: its start, its loads, and its Newton step after a pass."""
+    t, sums, block, join = types(spec), lane_sums(spec), blocks(spec), spatial(spec).join
+    T, vec3, Model, Lane, pick = t.T, t.vec3, t.Model, t.Lane, block.pick
     Links, Motions, Loads, Root, Newton = t.Links, t.Motions, t.Loads, t.Root, t.Newton
-    joint, join, FLOATING = joint_law(spec), spatial(spec).join, spec.floating
-    CONTACT, LIMIT, LOSS = spec.has("contact limit frictionloss")
-    JOINT_ROWS, SHARED, FULL_STEPS = LIMIT or LOSS, spec.threads_per_env > 1, FULL_STEP_PASSES[LOSS]
-    ROUNDING = ROUND_OFF * (6e-8 if t.U == wp.float32 else 1.1e-16)
-    FIRST = 0 if spec.floating else 1 + spec.inert  # the first link with inertia
+    joint, ground, limits, search = joint_law(spec), ground_contact(spec), joint_limits(spec), step_length(spec)
     PAIRS, pairs = spec.pairs > 0, pair_rows(spec) if spec.pairs else None
-    ROOM, FULL = contact_room(spec), spec.spheres > contact_room(spec)
+    CONTACT, LIMIT, LOSS = spec.has("contact limit frictionloss")
+    FLOATING, SHARED, JOINT_ROWS = spec.floating, spec.threads_per_env > 1, LIMIT or LOSS
+    FIRST, ROOM = 0 if FLOATING else 1 + spec.inert, contact_room(spec)  # the first link with inertia
 
     @wp.func
     def initialize(m: Model, here: Lane, links: Links, motions: Motions, loads: Loads, free_loads: Loads, root: Root):
@@ -61,9 +53,9 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                 motions[i].accel_link = motions[m.parent[k]].accel_link + motions[i].C
                 motions[i].free_force = joint.force(m, here, k, motions[i].motor, q, qd)
                 if wp.static(LIMIT):
-                    motions[i].limit = constraint.limit_state(m, here, k, q, qd)
+                    motions[i].limit = limits.limit_state(m, here, k, q, qd)
                 if wp.static(JOINT_ROWS):
-                    con = constraint.joint_constraint(m, k, motions[i].limit, qd, T(0.0), T(1.0))
+                    con = limits.joint_constraint(m, k, motions[i].limit, qd, T(0.0), T(1.0))
                     motions[i].con_force = con[0]
                     motions[i].con_slope = con[1]
 
@@ -77,145 +69,10 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             load.f = load.f + join(load.a * a + load.b * l, a * load.b + load.d * l)
             if wp.static(CONTACT):
                 if i >= FIRST:
-                    load = constraint.add_contacts(motions[i].contacts_begin, motions[i].contacts_end, contacts, load)
+                    load = ground.add_contacts(motions[i].contacts_begin, motions[i].contacts_end, contacts, load)
             loads[i] = load
         if wp.static(PAIRS):
             pairs.add_forces(m, here, contacts, motions, loads)
-
-    @wp.func
-    def evaluate_trial(
-        m: Model, here: Lane, links: Links, motions: Motions, contacts: t.Contacts, alpha: T, evaluation: int
-    ):
-        """Evaluate the constraints after the trial step alpha s; alpha is 1 in evaluation 0.
-
-        Returns (s.(f - alpha H s - f(alpha s)), s.H s, s.H(alpha s) s, the square of that difference of forces as an
-        acceleration, the ratio of contact stiffness to inertia, 0).
-        """
-        total = vec6()
-        for i in range(here.n):
-            k = here.at + i
-            if wp.static(JOINT_ROWS):
-                if i > 0:
-                    step = motions[i].u
-                    linear = motions[i].con_slope * step
-                    accel = motions[i].accel_joint + alpha * step
-                    trial = constraint.joint_constraint(m, k, motions[i].limit, links[i].qd, accel, T(0.0))
-                    force_error = motions[i].con_force - alpha * linear - trial[0]
-                    w = T(m.limit_params[k][4])
-                    accel_error = w * force_error / (T(1.0) + w * trial[1])
-                    total = total + T(m.owned[k]) * vec6(
-                        step * force_error,
-                        step * linear,
-                        step * trial[1] * step,
-                        accel_error * accel_error,
-                        T(0.0),
-                        T(0.0),
-                    )
-                    motions[i].trial_force = trial[0]
-                    motions[i].trial_slope = trial[1]
-            if wp.static(CONTACT):
-                if i >= FIRST:
-                    begin, end = motions[i].contacts_begin, motions[i].contacts_end
-                    total = total + constraint.trial_contacts(
-                        m, here, begin, end, motions[i].A, alpha, evaluation, contacts
-                    )
-        if wp.static(FULL):
-            total[3] = total[3] + T(wp.where(here.contacts > ROOM, UNSOLVED, 0.0))
-        if wp.static(PAIRS):
-            total = total + pairs.trial(m, here, motions, alpha, contacts)
-        if wp.static(SHARED):
-            for r in range(5):
-                total[r] = sums.add(total[r])
-        return total
-
-    @wp.func
-    def inertia_along(m: Model, here: Lane, motions: Motions, free_loads: Loads):
-        """Return s.M s of the step s."""
-        inertia = T(0.0)
-        for i in range(here.n):
-            k = here.at + i
-            a = wp.spatial_top(motions[i].A)
-            l = wp.spatial_bottom(motions[i].A)
-            load = free_loads[i]
-            inertia = inertia + wp.dot(a, load.a * a + T(2.0) * (load.b * l)) + wp.dot(l, load.d * l)
-            if i > 0:
-                inertia = inertia + T(m.owned[k]) * T(m.armature[k]) * motions[i].u * motions[i].u
-        if wp.static(SHARED):
-            inertia = sums.add(inertia)
-        return inertia
-
-    @wp.func
-    def next_trial(alpha: T, bracket: vec4, first: T, slope: T, curvature: T, slope_tolerance: T, evaluation: int):
-        """Return the next step length alpha to try, or the same one if it is accepted, and the bracket.
-
-        bracket: an alpha that is too small and the slope of the cost there, then the same of one that is too large;
-        first: minus the slope at alpha = 0. The slope grows with alpha.
-        """
-        excess = T(0.5) * slope * slope / curvature  # of the cost over its least
-        rejected = pick(T(COST_TOLERANCE) * first * alpha, excess, T(1.0), T(0.0))
-        whole = pick(alpha, T(1.0), T(0.0), T(1.0))
-        rejected = pick(T(0.0), whole, pick(slope_tolerance * first, slope, T(1.0), T(0.0)), rejected)
-        long = pick(T(0.0), slope, rejected, T(0.0))
-        short = rejected - long
-        bracket[0] = pick(T(0.0), short, alpha, bracket[0])
-        bracket[1] = pick(T(0.0), short, slope, bracket[1])
-        bracket[2] = pick(T(0.0), long, alpha, bracket[2])
-        bracket[3] = pick(T(0.0), long, slope, bracket[3])
-        width = bracket[2] - bracket[0]
-        # At a kink of the slope, Newton's method leaves the bracket, and secants approach from one side only.
-        secant = bracket[0] - width * bracket[1] / (bracket[3] - bracket[1])
-        inside = wp.max(wp.min(secant, bracket[2] - T(BRACKET_MARGIN) * width), bracket[0] + T(BRACKET_MARGIN) * width)
-        if evaluation > 1:
-            inside = bracket[0] + T(0.5) * width
-        following = alpha - slope / curvature
-        following = pick(bracket[0], following, pick(following, bracket[2], following, inside), inside)
-        if evaluation == MAX_EVALUATIONS - 1:  # an alpha that lowers the cost, if one is known
-            following = pick(T(0.0), bracket[0], bracket[0], following)
-        return pick(T(0.0), rejected, following, alpha), bracket
-
-    @wp.func
-    def line_search(
-        # model
-        m: Model,
-        here: Lane,
-        # kinematics and inertia in
-        links: Links,
-        free_loads: Loads,
-        # iterate and trial step, in and out
-        motions: Motions,
-        contacts: t.Contacts,
-        step_sq: T,
-        status: Newton,
-    ):
-        """Return the step length alpha with the least cost, or 1 if a whole step is accepted; step_sq is |s|^2."""
-        tolerance_sq = status.tolerance * status.tolerance
-        slope_tolerance = T(wp.where(status.passes < FULL_STEPS, 1.0, SLOPE_TOLERANCE))
-        alpha = T(1.0)
-        overshoots = T(0.0)
-        first = T(0.0)
-        bracket = vec4()
-        evaluation = int(0)
-        while evaluation <= MAX_EVALUATIONS:
-            total = evaluate_trial(m, here, links, motions, contacts, alpha, evaluation)
-            rounding = T(ROUNDING) * total[4]
-            remaining_sq = (T(1.0) - alpha) * (T(1.0) - alpha) + rounding * rounding
-            residual_sq = (T(COUPLING * COUPLING) * total[3] + remaining_sq * step_sq) / status.accel_sq
-            status.residual_sq = pick(T(0.0), status.active, residual_sq, status.residual_sq)
-            if evaluation == 0 and status.passes > 0:
-                rise = status.active * (total[0] - slope_tolerance * total[1])
-                overshoots = pick(tolerance_sq, residual_sq, rise, T(0.0))
-                if block.any_of(overshoots):
-                    first = inertia_along(m, here, motions, free_loads) + total[1]
-                    bracket[1] = -first
-            last = alpha
-            if evaluation < MAX_EVALUATIONS and block.any_of(overshoots):
-                slope = total[0] - (T(1.0) - alpha) * first
-                curvature = first - total[1] + total[2]
-                following, bracket = next_trial(alpha, bracket, first, slope, curvature, slope_tolerance, evaluation)
-                alpha = pick(T(0.0), overshoots, following, alpha)
-            evaluation = wp.where(block.any_of(wp.abs(alpha - last)), evaluation + 1, MAX_EVALUATIONS + 1)
-        status.active = pick(tolerance_sq, status.residual_sq, status.active, T(0.0))
-        return alpha, status
 
     @wp.func
     def newton_step(
@@ -255,7 +112,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             status.accel_sq = sums.add(status.accel_sq)
             step_sq = sums.add(step_sq)
         status.accel_sq = status.accel_sq + T(1.0)
-        alpha, status = line_search(m, here, links, free_loads, motions, contacts, step_sq, status)
+        alpha, status = search.line_search(m, here, links, free_loads, motions, contacts, step_sq, status)
         if wp.static(FLOATING):
             root.newton_wdot = root.newton_wdot + alpha * root.wdot
             root.newton_vdot = root.newton_vdot + alpha * root.vdot
@@ -265,10 +122,136 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             motions[i].con_force = motions[i].trial_force
             motions[i].con_slope = motions[i].trial_slope
         if wp.static(CONTACT):
-            constraint.accept_contacts(0, wp.min(here.contacts, ROOM), contacts)
+            ground.accept_contacts(0, wp.min(here.contacts, ROOM), contacts)
         if wp.static(PAIRS):
-            constraint.accept_contacts(here.begin, here.end, contacts)
+            ground.accept_contacts(here.begin, here.end, contacts)
         status.passes = status.passes + 1
         return root, status
+
+    return functions(locals())
+
+
+@cache
+def newton_method(spec: KernelSpec) -> SimpleNamespace:
+    """Make the accelerations of a substep with constraints."""
+    t, block, iterate, sweep = types(spec), blocks(spec), newton_iterate(spec), articulated(spec)
+    T, vec3, vec6, Model, Lane, Ck = t.T, t.vec3, t.vec6, t.Model, t.Lane, t.Checkpoint
+    Links, Motions, Loads, Root, Newton, Contacts = t.Links, t.Motions, t.Loads, t.Root, t.Newton, t.Contacts
+    ground, state, pairs = ground_contact(spec), state_access(spec), pair_rows(spec) if spec.pairs else None
+    CONTACT, CHAIN = spec.has("contact tendon_chain")
+    transmission = transmission_law(spec) if CHAIN else None
+    PAIRS, DAMPED, ROOM, NV, SOLVES = spec.pairs > 0, spec.damped, contact_room(spec), spec.nv, spec.solves
+
+    @wp.func
+    def set_loads(
+        m: Model, here: Lane, phase: int, motions: Motions, contacts: Contacts, free_loads: Loads, loads: Loads
+    ):
+        """Set the loads of a phase's pass: the iterate's, or for SOLVE inertias alone."""
+        if phase == SOLVE:
+            for i in range(here.n):
+                loads[i] = free_loads[i]
+                loads[i].f = vec6()
+        else:
+            iterate.linearize(m, here, motions, contacts, free_loads, loads)
+
+    @wp.func
+    def finish(m: Model, here: Lane, record: int, ck: Ck, motions: Motions, contacts: Contacts, root: Root):
+        """Set the accelerations, joints' into u, to the iterate's plus the change by damping; returns the base.
+
+        The checkpoint gets those before damping, at which the adjoint differentiates the constraints.
+        """
+        for i in range(1, here.n):
+            change = motions[i].u
+            motions[i].u = motions[i].accel_joint
+            if wp.static(DAMPED):
+                motions[i].accel_joint = motions[i].accel_joint + change
+        if record == 1:
+            state.record_accelerations(m, here, ck, NV, root.newton_vdot, root.newton_wdot, motions)
+            if wp.static(CONTACT):
+                ground.record_contacts(here, ck, contacts)
+            if wp.static(PAIRS):
+                pairs.record(here, ck, contacts)
+        for i in range(1, here.n):
+            motions[i].u = motions[i].accel_joint
+        if wp.static(not DAMPED):
+            root.vdot = vec3()
+            root.wdot = vec3()
+        root.vdot = root.newton_vdot + root.vdot
+        root.wdot = root.newton_wdot + root.wdot
+        return root
+
+    @wp.func
+    def accelerate(
+        # model
+        m: Model,
+        here: Lane,
+        # options
+        passes: int,  # at most
+        tolerance: T,
+        # kinematics, and loads without constraints in
+        links: Links,
+        carrier: t.CarrierPos,
+        loads: Loads,
+        # accelerations out
+        motions: Motions,
+        root: Root,
+        # work
+        free_loads: Loads,
+        contacts: Contacts,  # of the last substep in
+        # checkpoint out
+        record: int,  # 1 if it is written
+        ck: Ck,
+    ):
+        """Compute a substep's accelerations with constraints, those of joints into motions' u.
+
+        NEWTON passes until the iterate has converged. FACTOR writes the factor about the last iterate for the adjoint,
+        if that is recorded. SOLVE takes MuJoCo's implicit damping, (M + h b) change = -h b a. All phases share one loop
+        and so one call of the sweep: a compiler would write out each call, and the kernel be three times as long.
+
+        Returns:
+            the lane, with the number of its contacts; the base; the square of the residual.
+        """
+        status = Newton()
+        status.tolerance = tolerance
+        status.active = T(1.0)
+        status.accel_sq = T(1.0)
+        root.newton_vdot = vec3()
+        root.newton_wdot = vec3()
+        root.wdot = vec3()
+        root.vdot = vec3()
+        if wp.static(CONTACT):
+            here.contacts = ground.begin_contacts(m, here, links, carrier, motions, contacts)
+        iterate.initialize(m, here, links, motions, loads, free_loads, root)
+        if wp.static(PAIRS):
+            here.begin = int(ROOM)
+            here.end = pairs.begin(m, here, links, motions, root.pos, contacts)
+        phase = int(NEWTON)
+        while phase < DONE:
+            if phase == NEWTON and (status.passes == passes or not block.any_of(status.active)):
+                phase = DONE - int(DAMPED)
+                if record == 1:
+                    phase = FACTOR
+            if phase < DONE:
+                here.factor_row = SOLVES * here.row
+                if wp.static(DAMPED):
+                    if phase == FACTOR:
+                        here.factor_row = here.factor_row + 1
+                here.store_factor = record * wp.where(phase > NEWTON, 1, 0)
+                set_loads(m, here, phase, motions, contacts, free_loads, loads)
+                sweep.inward(m, here, phase, ck, links, motions, loads)
+                root = sweep.accelerate(m, here, phase, ck, links, motions, loads[0], root)
+                if phase == NEWTON:
+                    if wp.static(PAIRS):
+                        root = pairs.correct_step(m, here, links, contacts, motions, root, status)
+                    root, status = iterate.newton_step(m, here, links, free_loads, motions, contacts, root, status)
+                else:
+                    if wp.static(CHAIN):
+                        if phase == SOLVE:
+                            root = transmission.correct_change(m, here, links, motions, root)
+                    phase = phase + 1
+                    if wp.static(not DAMPED):
+                        phase = DONE
+        root = finish(m, here, record, ck, motions, contacts, root)
+        return here, root, status.residual_sq
 
     return functions(locals())

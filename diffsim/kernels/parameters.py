@@ -15,34 +15,30 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.laws.joint import joint_law
-from diffsim.kernels.mujoco.constraint import constraint_law
+from diffsim.kernels.mujoco.limits import joint_limits
+from diffsim.kernels.thread.columns import ARMATURE, DAMPING, JOINT, LINK, LOSS, MOTOR, SERVO_DAMPING, STIFFNESS, WEIGHT
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
 from diffsim.kernels.tree.kinematics import kinematics
 
-# Columns: of each link mass, first moments (3) and moments of inertia xx, yy, zz, xy, xz, yz; of each joint, in its
-# link's row, those named below; of each motor gear and bias; of each contact with the ground, and then of each block of
-# rows between bodies (pairs.py), friction and the logarithm of its weight.
-LINK, JOINT, MOTOR, CONTACT = 10, 6, 2, 2
-ARMATURE, DAMPING, LOSS, WEIGHT, STIFFNESS, SERVO_DAMPING = range(JOINT)
-
 
 @cache
 def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
+    """Make the gradients by the constants of links, joints and motors."""
     t, sp, kin, joint, block = types(spec), spatial(spec), kinematics(spec), joint_law(spec), blocks(spec)
     T, vec3, vec6, mat3, Model, Lane, Ck, Array = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Lane, t.Checkpoint, t.Ts
     Link, Node, pick, load = t.Link, t.Node, block.pick, kin.load
-    constraint = constraint_law(spec) if spec.constrained else None
-    LIMIT, FRICTIONLOSS, CLAMP, MOTORS, EXPLICIT_SERVOS = spec.has("limit frictionloss clamp motor explicit_servos")
+    limits = joint_limits(spec) if spec.constrained else None
+    LIMIT, FRICTIONLOSS, CLAMP, DRIVEN, EXPLICIT_SERVOS = spec.has("limit frictionloss clamp motor explicit_servos")
     LIMIT, CONSTRAINED, DAMPED, IMPLICIT = LIMIT and spec.constrained, spec.constrained, spec.damped, spec.implicit
     FIRST, VADR, NV, NU = 0 if spec.floating else 1, spec.dof0 - 1, spec.nv, spec.nu
-    JOINTS = LINK * spec.nlink
-    MOTOR0 = JOINTS + JOINT * spec.nlink
+    JOINTS, MOTORS = spec.columns.joints, spec.columns.motors  # links' columns come first
 
     @wp.func
     def add(columns: Array, k: int, value: T):
+        """Add a value to a column."""
         columns[k] = columns[k] + value
 
     @wp.func
@@ -88,7 +84,7 @@ def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
         add(columns, k + STIFFNESS, unclamped * lam * link.q)
         add(columns, k + SERVO_DAMPING, servo)
         if wp.static(LIMIT):
-            limit = constraint.limit_state(m, here, i, link.q, link.qd)
+            limit = limits.limit_state(m, here, i, link.q, link.qd)
             jar = limit[2] * qdd + limit[1]
             add(columns, k + WEIGHT, -lam * limit[2] * pick(jar, T(0.0), limit[0], T(0.0)) * jar)
         if wp.static(FRICTIONLOSS):
@@ -100,7 +96,7 @@ def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_parameters(m: Model, here: Lane, ck: Ck, links: t.Links, nodes: t.Nodes, ctrl: t.array2, columns: Array):
-        """Add the derivatives of phi, without those of contacts: constraint.add_contacts_adjoint has these."""
+        """Add the derivatives of phi, without those of contacts: ground.add_contacts_adjoint has these."""
         for i in range(FIRST, here.n):
             add_product(columns, LINK * i, links[i], nodes[i].W, nodes[i].A)
             add_product(columns, LINK * i, links[i], wp.spatial_cross(nodes[i].W, links[i].V), links[i].V)
@@ -108,14 +104,14 @@ def parameter_adjoint(spec: KernelSpec) -> SimpleNamespace:
                 add_product(columns, LINK * i, links[i], nodes[i].W1, nodes[i].D)
         for i in range(1, here.n):
             add_joint(m, here, i, ck, links[i], nodes[i], nodes[m.parent[i]], columns)
-        if wp.static(MOTORS):
+        if wp.static(DRIVEN):
             for k in range(NU):
                 i = m.motor_slot[k]
                 push = -nodes[i].lam
                 if wp.static(CLAMP):
                     push = nodes[i].unclamped * push
                 if i > 0:
-                    add(columns, MOTOR0 + MOTOR * k, push * block.read(ctrl, here.e, k))
-                    add(columns, MOTOR0 + MOTOR * k + 1, push)
+                    add(columns, MOTORS + MOTOR * k, push * block.read(ctrl, here.e, k))
+                    add(columns, MOTORS + MOTOR * k + 1, push)
 
     return functions(locals())

@@ -31,6 +31,7 @@ from diffsim.kernels.tree.branches import branch_solver
 
 @cache
 def transmission_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the forces of actuators on fixed tendons and at sites, and their adjoint."""
     t, block, joint = types(spec), blocks(spec), joint_law(spec)
     T, vec3, Model, Lane, Links, Nodes, pick = t.T, t.vec3, t.Model, t.Lane, t.Links, t.Nodes, block.pick
     wrench_to_world, clamped = muscle_law(spec).wrench_to_world, clamp_law(spec).clamped
@@ -90,6 +91,7 @@ def transmission_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def chain_range(m: Model):
+        """Return where the damped chain's joints begin and end."""
         k = m.tendon_chain[0]
         return m.tendon_begin[k], m.tendon_begin[k + 1]
 

@@ -32,6 +32,11 @@ class LinearGaussian(NamedTuple):
         tangent = system.difference(x, self.x[t])
         return self.u[t] + (self.K[t] @ tangent.unsqueeze(-1)).squeeze(-1)
 
+    def widened(self, sigma: Tensor) -> LinearGaussian:
+        """Return the same feedback with noise of another scale: the root mean square of its deviations / sigma is 1."""
+        width = self.L.square().sum(-1).sqrt() / sigma
+        return self._replace(L=self.L / width.square().mean().sqrt())
+
     def log_prob(self, system: System, x: Tensor, u: Tensor) -> Tensor:
         """(m, T) log q(u_t | x_t) of anyone's trajectories x (m, T + 1, nx), u (m, T, nu)."""
         error = (u - self.mean(system, slice(0, u.shape[1]), x[:, :-1])).unsqueeze(-1)

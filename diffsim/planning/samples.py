@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -32,6 +33,12 @@ class Samples(NamedTuple):
     def spread(self) -> tuple[float, float]:
         """Mean and standard deviation of the returns."""
         return self.returns.mean().item(), self.returns.std(correction=0).item()
+
+    @property
+    def log_mixture(self) -> Tensor:
+        """(m, T) log density of prefixes under the mixture of the generators that these samples come from."""
+        log_q = self.log_q[:, self.source.unique()]
+        return torch.logsumexp(log_q, 1) - math.log(log_q.shape[1])
 
 
 class SampleSet:

@@ -9,38 +9,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import matrix_of
-from diffsim.robot.elements import motors, muscles, servos
-from diffsim.robot.scene import Array, Index, takes_euler
+from diffsim.robot.contacts import matrix_of
+from diffsim.robot.elements import motors, muscles, servos, takes_euler
+from diffsim.robot.types import Array, Transmissions
 
 Transmission, Ball = mujoco.mjtTrn, mujoco.mjtJoint.mjJNT_BALL
 Mask = NDArray[np.bool_]
 Body = tuple[int, Array, Array]  # a body's link, and its orientation and position in the link's frame
-
-
-class Transmissions(NamedTuple):
-    """Actuators on fixed tendons and at sites, for kernels/transmission.py."""
-
-    tendon: Index  # (nt,) actuators on fixed tendons
-    law: Array  # (nt, 4) stiffness [N/m] and damping [N s/m] by the tendon's length, then the bounds of the force [N]
-    begin: Index  # (nt + 1,) of each tendon in the two that follow
-    link: Index  # (nj,) its joints' links
-    coef: Array  # (nj,) the tendon's change of length by each joint's position, times the actuator's gear
-    chain: Index  # (1,) the tendon with damping along a chain of joints, -1 if none
-    site: Index  # (ns,) actuators at sites
-    site_link: Index  # (ns,) the links that they push
-    torque: Array  # (ns, 3) m, per force of the actuator, about the link's origin and in the link's frame
-    force: Array  # (ns, 3) the same of the force
-
-    def features(self, constrained: bool, explicit: bool) -> frozenset[str]:
-        """Return the features of these actuators with MuJoCo's constraints or not, whose damping may be explicit."""
-        present = {
-            "tendon": len(self.tendon),
-            "site": len(self.site),
-            "tendon_damping": bool(self.law[:, 1].any()) and not explicit,
-            "tendon_chain": self.chain[0] >= 0 and constrained and not explicit,
-        }
-        return frozenset(name for name, used in present.items() if used)
 
 
 def on_joint(m: mujoco.MjModel) -> Mask:
@@ -93,13 +68,25 @@ def turning(m: mujoco.MjModel) -> Mask:
     return turns
 
 
-def servo_sums(m: mujoco.MjModel, nlink: int) -> Array:
-    """Sum the affine biases (3, joints) of the joints' actuators: force at zero, stiffness and damping."""
+class Servo(NamedTuple):
+    """What servos add to each degree of freedom after the base, in its units."""
+
+    push: Array  # (joints,) force at position zero
+    stiffness: Array  # (joints,)
+    damping: Array  # (joints,)
+
+    def where(self, mask: Mask) -> Servo:
+        """Return a copy that is zero elsewhere."""
+        return Servo(*(np.where(mask, values, 0.0) for values in self))
+
+
+def servo_sums(m: mujoco.MjModel, nlink: int) -> Servo:
+    """Sum the affine biases of the joints' actuators."""
     sums = np.zeros((3, nlink - 1))
     for a in np.flatnonzero(servos(m) & on_joint(m)).tolist():
         link, gear = gear_of(m, a, nlink)
         sums[:, link - 1] += m.actuator_biasprm[a, :3] * (gear, -(gear**2), -(gear**2))
-    return sums
+    return Servo(*sums)
 
 
 def force_bounds(m: mujoco.MjModel, nlink: int) -> Array:

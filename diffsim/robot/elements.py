@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.scene import Array
+from diffsim.robot.types import Array
 
 Kind = mujoco.mjtObj
 MOST_NAMES = 8  # in one message
@@ -65,6 +65,11 @@ def control_range(m: mujoco.MjModel) -> tuple[Array, Array]:
     limited = m.actuator_ctrllimited != 0
     low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(muscles(m), 0.0, -1.0))
     return low, np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
+
+
+def takes_euler(m: mujoco.MjModel) -> bool:
+    """Tell whether MuJoCo's constraints are stepped as by its Euler, and not as by its implicitfast."""
+    return m.opt.integrator in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def home_key(m: mujoco.MjModel) -> int:

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.actuator import force_bounds, gear_of, on_joint, servo_sums, transmissions_of
-from diffsim.robot.contact import contact_points, ground_pairs, matrix_of
+from diffsim.robot.contacts import contact_points, ground_pairs, matrix_of
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, muscles, numeric, servos
 from diffsim.robot.pairs import with_obstacles, with_pairs
 from diffsim.robot.refuse import beyond, obstacles, strays
-from diffsim.robot.scene import Array, Scene, SceneError, Spheres
+from diffsim.robot.scene import Scene, Spheres
+from diffsim.robot.types import Array, SceneError
 
 Geom, Joint = mujoco.mjtGeom, mujoco.mjtJoint
 DOFS = {int(Joint.mjJNT_FREE): 6, int(Joint.mjJNT_BALL): 3}  # of joints with several
@@ -25,6 +26,18 @@ DOFS = {int(Joint.mjJNT_FREE): 6, int(Joint.mjJNT_BALL): 3}  # of joints with se
 
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
     """Read an MJCF file or copy a model.
+
+    Example:
+        scene = diffsim.load_scene("robot.xml")
+        print(scene.nq, scene.nv, scene.nu, scene.qpos0)
+
+    Args:
+        path: file, or a model or specification of MuJoCo, which stays as it is.
+
+    Returns:
+        The robot for Simulator, with MuJoCo's sizes nq, nv and nu, the pose qpos0 (nq,) at rest, the ground_height [m],
+        a copy of the model as mj_model and, in left_out, what of the file is not simulated. `with_terrain(vertices)`
+        and `with_penalty(constants)` return copies on other ground or with other constants of the penalty law.
 
     Raises:
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
@@ -38,7 +51,7 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
         except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
     else:
-        raise SceneError(f"robot file {str(path)!r} does not exist")
+        raise SceneError(f"robot file {str(path)!r} {'is a folder' if file.is_dir() else 'does not exist'}")
     if left_out := [] if isinstance(path, mujoco.MjModel) else strays(model):
         spec = path.copy() if isinstance(path, mujoco.MjSpec) else mujoco.MjSpec.from_file(str(file))
         for body in left_out:
@@ -187,18 +200,17 @@ class _Reader:
         m = self.m
         servo, (low, high) = servo_sums(m, self.nlink), force_bounds(m, self.nlink)
         bounded = np.isfinite(low) | np.isfinite(high)
-        push, stiffness, damping = np.where(bounded, 0.0, servo)  # these join the joint's own
+        free, within = servo.where(~bounded), servo.where(bounded)  # the free ones join the joint's own
         ref = np.where(ball, 0.0, m.qpos_spring[m.jnt_qposadr[joint]])  # a ball's is the identity in every MJCF
-        total, joined = m.jnt_stiffness[joint] + stiffness, (stiffness > 0) | (push != 0)
-        moved = np.divide(m.jnt_stiffness[joint] * ref + push, total, out=ref.copy(), where=total > 0)
-        push, stiffness_within, damping_within = np.where(bounded, servo, 0.0)
-        own = np.divide(push, stiffness_within, out=np.zeros_like(push), where=stiffness_within > 0)
+        total, joined = m.jnt_stiffness[joint] + free.stiffness, (free.stiffness > 0) | (free.push != 0)
+        moved = np.divide(m.jnt_stiffness[joint] * ref + free.push, total, out=ref.copy(), where=total > 0)
+        own = np.divide(within.push, within.stiffness, out=np.zeros_like(ref), where=within.stiffness > 0)
         return {
-            "damping": (m.dof_damping[self.first :] + damping, 0.0),
+            "damping": (m.dof_damping[self.first :] + free.damping, 0.0),
             "stiffness": (total, 0.0),
             "spring_ref": (np.where(joined, moved, ref), 0.0),
-            "servo_stiffness": (stiffness_within, 0.0),
-            "servo_damping": (damping_within, 0.0),
+            "servo_stiffness": (within.stiffness, 0.0),
+            "servo_damping": (within.damping, 0.0),
             "servo_ref": (own, 0.0),
             "force_low": (low, -np.inf),
             "force_high": (high, np.inf),

@@ -10,10 +10,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
+from diffsim.robot.contacts import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
-from diffsim.robot.scene import Array, Index, Scene, SceneError
+from diffsim.robot.scene import Scene
 from diffsim.robot.shapes import as_primitives, is_exact, obstacle_geoms
+from diffsim.robot.types import Array, Index, SceneError
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
 Touch = Callable[[int, int], Array]  # two geoms
@@ -227,6 +228,10 @@ def obstacle_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
 
 def with_pairs(scene: Scene) -> Scene:
     """Return a copy whose parts touch each other and fixed geoms as the file lets them, on MuJoCo's contact.
+
+    Example:
+        from diffsim.robot.pairs import with_pairs
+        scene = with_pairs(diffsim.load_scene("robot.xml"))  # for Simulator, or to return from Task.load_robot
 
     Capsules and boxes stand for other shapes, see `as_primitives`. A pair is left out that so overlaps in the first
     keyframe, or the reference pose, though the file's shapes do not.

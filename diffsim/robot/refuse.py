@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim.robot.actuator import Mask, at_site, driven, on_joint, on_tendon, refused, turning
-from diffsim.robot.contact import POINTS, declared_pairs, ground_pairs, pair_law
+from diffsim.robot.contacts import POINTS, declared_pairs, ground_pairs, pair_law
 from diffsim.robot.elements import (
     at_rest,
     disabled_flags,
@@ -24,7 +24,8 @@ from diffsim.robot.elements import (
     numeric,
     servos,
 )
-from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
+from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
+from diffsim.robot.types import Array
 
 Joint = mujoco.mjtJoint
 # The kind of an element, a mask of those elements or their names, and what is not simulated of them

@@ -11,15 +11,13 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.terrain import TerrainError, check_terrain
+from diffsim.robot.elements import takes_euler
+from diffsim.robot.profile import TerrainError, check_terrain
+from diffsim.robot.types import Array, Index, Transmissions
 
 if TYPE_CHECKING:
-    from diffsim.robot.actuator import Transmissions
-    from diffsim.robot.constraint import Constraints
+    from diffsim.robot.constants import Constraints
     from diffsim.robot.pairs import Pairs
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int32]
 
 # Constants of soft contact (Eq. 3) and limits (Eq. 4), with their units. In the MJCF
 # <custom><numeric name="k_n" data="2e4"/></custom> sets one.
@@ -33,10 +31,6 @@ PENALTY_CONSTANTS = {
 }
 # What may differ between environments, see Simulator: each column of its factors multiplies one of these.
 FACTORS = (*PENALTY_CONSTANTS, "mass", "motor")
-
-
-class SceneError(ValueError):
-    """Raised for an MJCF file that is missing, broken or not supported; names the element."""
 
 
 class RootCoordinates(NamedTuple):
@@ -55,11 +49,6 @@ class Spheres(NamedTuple):
     radius: Array  # (n,)
     geom: Index  # (n,) the geom that each stands for
     axis: Array  # (n, 3) a capsule's unit vector along it, of a box's corner its place from the centre [m], else 0
-
-
-def takes_euler(m: mujoco.MjModel) -> bool:
-    """Tell whether MuJoCo's constraints are stepped as by its Euler, and not as by its implicitfast."""
-    return m.opt.integrator in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,7 +122,7 @@ class Scene:
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
     geom_pairs: tuple[tuple[int, int], ...] = ()  # of the robot's geoms that may touch each other, see robot/pairs.py
-    constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
+    constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constants.py
     transmissions: Transmissions | None = None  # actuators on fixed tendons and at sites, whose motor_link is 0
     parameters: int = 0  # number of constants whose gradients the backward kernel computes, see diffsim/parameters.py
 

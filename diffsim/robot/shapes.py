@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.contact import UNBOUNDED, base_geoms, hull, matrix_of
-from diffsim.robot.scene import Array
+from diffsim.robot.contacts import UNBOUNDED, base_geoms, hull, matrix_of
+from diffsim.robot.types import Array
 
 _Geom = mujoco.mjtGeom
 SHAPES = [int(getattr(_Geom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "MESH")]  # made others

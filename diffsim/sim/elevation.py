@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 
 
 class Elevation:

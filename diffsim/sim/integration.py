@@ -13,13 +13,19 @@ TOLERANCE = 1e-4  # as measured in docs/physics.md
 class Integration(NamedTuple):
     """Options of the integrator; docs/physics.md has the equations.
 
+    Example:
+        diffsim.Integration("mujoco", substeps=8, tolerance=1e-6)
+
     Attributes:
         contact: "soft" (the SHAC paper's springs and dampers) or "mujoco" (MuJoCo's own steps, with constraints for
             contact, limits and dry friction).
         substeps: integration steps per control step.
         implicit: only "soft": damping and friction act at the end of a substep. Otherwise it is semi-implicit Euler.
         tolerance: only "mujoco": residual that ends Newton's method, see Simulator.residual.
-        onset: only "mujoco": length [m] over which a contact begins, see robot.constraint.soften; 0: as in the file.
+        onset: only "mujoco": length [m] over which a contact begins, see robot.constants.soften; 0: as in the file.
+
+    Raises:
+        ValueError: by the simulator that gets it, of an option that it cannot have.
     """
 
     contact: str = "soft"

@@ -14,7 +14,7 @@ import warp as wp
 from diffsim import startup
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.mujoco.constraint import pair_column
+from diffsim.kernels.mujoco.ground import pair_column
 from diffsim.kernels.thread.division import Division, divide
 from diffsim.kernels.thread.model import model_of, types
 from diffsim.kernels.thread.spec import kernel_spec

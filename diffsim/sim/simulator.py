@@ -10,13 +10,14 @@ import torch
 import warp as wp
 from torch.autograd.forward_ad import unpack_dual
 
-from diffsim.robot.constraint import IMPEDANCE, check_soft, constrained
+from diffsim.robot.constants import IMPEDANCE, check_soft, constrained
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options
 from diffsim.sim.tangent import Tangent
+from diffsim.sim.window import Window
 
 DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # that the constraints' adjoint divides by
 PASSES = 30  # of Newton's method in a substep, at most, as measured in docs/physics.md
@@ -29,6 +30,16 @@ State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 
 class Simulator:
     """A batch of independent copies of one scene, stepped by control steps of equal length.
+
+    Example:
+        scene = diffsim.load_scene("robot.xml")
+        sim = diffsim.Simulator(scene, 16, diffsim.Integration("mujoco", 8), control_dt=0.02, horizon=2)
+        qpos, qvel = torch.tensor(scene.qpos0).float().repeat(16, 1), torch.zeros(16, scene.nv)
+        ctrl = torch.zeros(16, scene.nu, requires_grad=True)              # in [-1, 1]
+        for _ in range(2):
+            qpos, qvel = sim.step(qpos, qvel, ctrl)
+        qvel.sum().backward()
+        sim.rewind()                                                      # the next rollout
 
     Up to `horizon` differentiable control steps make a rollout, and `rewind` begins the next one. A backward pass must
     run before the next rollout overwrites its steps, otherwise it raises RuntimeError.
@@ -47,11 +58,12 @@ class Simulator:
     Attributes:
         factors: (N, 8) multipliers of the scene's constants, initially ones. Columns as in scene.FACTORS: constants of
             contact and of limits; mass and inertia of all links, without armature; force of motors and muscles. Change
-            it in place or assign another tensor. A step uses the values at its call and is differentiable in them.
-            (N, 0) without factors=True.
+            it in place or assign another tensor. A step uses the values at its call. A factor has no gradient: use
+            ParametricSimulator.parameters. (N, 0) without factors=True.
         forces: (N, nbody, 6) external force [N] and torque [N m] on each body in world axes at its centre of mass,
             initially zero, constant over a control step: MuJoCo's xfrc_applied, with rows as in scene.mj_model. Used
-            like factors. Forces on the world and on bodies fixed to it have no effect. (N, 0, 6) without forces=True.
+            like factors, but a step is differentiable in them. Forces on the world and on bodies fixed to it have no
+            effect. (N, 0, 6) without forces=True.
         nonfinite: (N,) bool, environments whose last step failed, see docs/physics.md. They keep the state from before
             it, with zero gradient. Other environments do not change.
         residual: (N,) largest residual of Newton's method in the last step, see docs/physics.md. Zeros on soft contact.
@@ -88,7 +100,8 @@ class Simulator:
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
         self._end_widths = scene.nq, scene.nv + hard  # with constraints a column for the residual
-        check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
+        kept = f"states and actions of a horizon of {horizon:,} steps"
+        check_memory(kept, n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
         self._launcher = Launcher(self._with_contact(scene, how), n, self.options)
         self._factors, self._forces = self._zeros(n, width) + 1, self._zeros(n, bodies, 6)
         self._start, self._g_start = self._zeros(slots, n, sum(self._widths)), self._zeros(n, sum(self._widths))
@@ -97,8 +110,7 @@ class Simulator:
         self.nonfinite_gradients, self.unconverged = self._zeros(2, n, dtype=torch.int32)
         self._rows: Any = None  # what backward needs of each substep, of all slots
         self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
-        self._slot, self._last = 0, horizon  # of the rollout's next differentiable step, of the last step
-        self._versions = [0] * horizon  # each slot serves a new step in each rollout
+        self._window, self._last = Window(horizon), horizon  # slot of the last step
 
     def _zeros(self, *size: int, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.zeros(size, dtype=dtype or self.dtype, device=self.device)
@@ -125,6 +137,7 @@ class Simulator:
 
     @factors.setter
     def factors(self, value: torch.Tensor) -> None:
+        self._refuse_gradient(value)
         self._factors = self._check_given("factors", value, *self._factors.shape[1:])
 
     @property
@@ -149,7 +162,7 @@ class Simulator:
             scene = self._with_contact(self.scene, how)
             self._launcher.rewrite(scene, ("contact_params", "row_params"), IMPEDANCE)
         self.integration, self.options = how, self.options._replace(integration=how)
-        self._versions = [version + 1 for version in self._versions]
+        self._window.forget()
 
     def _with_contact(self, scene: Scene, how: Integration) -> Scene:
         """Return a copy with MuJoCo's constraints, or the scene itself on soft contact, if it supports the scene."""
@@ -159,7 +172,7 @@ class Simulator:
         return scene
 
     def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        """Advance all environments by one control step, differentiable in its arguments, `factors` and `forces`.
+        """Advance all environments by one control step, differentiable in its arguments and `forces`.
 
         Args:
             qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, which need not have unit length.
@@ -171,8 +184,8 @@ class Simulator:
             qpos, qvel after the step, of the same shapes.
 
         Raises:
-            ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors or forces that were changed
-                in place to what is not allowed.
+            ValueError: an argument of the wrong shape, dtype or device; factors that require grad; on the CPU, factors
+                or forces that were changed in place to what is not allowed.
             RuntimeError: a differentiable step in a full rollout.
         """
         for name, value, width in zip(("qpos", "qvel", "ctrl"), (qpos, qvel, ctrl), self._widths, strict=False):
@@ -181,20 +194,14 @@ class Simulator:
 
     def advance(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
         """Do what `step` does, without checks of shape, dtype and device."""
+        self._refuse_gradient(self._factors)
         if self.device.type == "cpu":  # on a GPU the check would wait for the device
             for name, given in (("factors", self._factors), ("forces", self._forces)):
                 if given.shape[1]:
                     self._check_given(name, given, *given.shape[1:])
         start = (qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
         if torch.is_grad_enabled() and any(part.requires_grad for part in start):
-            if self._slot == self.horizon:
-                raise RuntimeError(
-                    f"horizon of {self.horizon} differentiable steps exceeded: begin a new rollout by an environment's "
-                    "detach() or a simulator's rewind(), step under torch.no_grad(), or make it with a larger horizon"
-                )
-            slot, self._slot = self._slot, self._slot + 1
-            self._versions[slot] += 1
-            both = ControlStep.apply(self, slot, *start)
+            both = ControlStep.apply(self, self._window.take(), *start)
         else:
             both = self._forward(self.horizon, *start)
         end: State = both.split(self._widths[:2], dim=1)
@@ -217,18 +224,18 @@ class Simulator:
         rotation vector in the body's frame. Arguments are as for `step`. The rollout must have room for a step. Rows of
         `nonfinite` environments are zero.
         """
-        leaves, slot = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._slot
+        leaves, used = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._window.used
         with torch.enable_grad():
             end = torch.cat(self.step(*leaves), dim=1)
         cotangents = self.tangent.left_inverse(end.detach()).unbind(1)
         rows = [torch.autograd.grad(end, leaves, row, retain_graph=True) for row in cotangents]
-        self._slot = slot
+        self._window.used = used
         g_qpos, g_qvel, B = (torch.stack(part, dim=1) for part in zip(*rows, strict=True))
         return torch.cat((g_qpos, g_qvel), dim=2) @ self.tangent.basis(torch.cat(leaves[:2], dim=1).detach()), B
 
     def rewind(self) -> None:
         """Begin a new rollout of differentiable steps."""
-        self._slot = 0
+        self._window.used = 0
 
     def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
         key = (kernel, slot)
@@ -273,6 +280,11 @@ class Simulator:
             have, must = (" ".join(map(str, each)) for each in (found, wanted))
             raise ValueError(f"{name} is {have}, must be a torch.Tensor of {must}")
 
+    def _refuse_gradient(self, factors: torch.Tensor) -> None:
+        """Raise ValueError if factors require grad; a scene's parameters, which are in their place, may."""
+        if isinstance(factors, torch.Tensor) and factors.requires_grad and not self.scene.parameters:
+            raise ValueError("factors require grad, but a factor has no gradient: use ParametricSimulator.parameters")
+
     def _check_given(self, name: str, value: torch.Tensor, *size: int) -> torch.Tensor:
         """Raise ValueError unless factors or forces are finite, and factors not negative, divisors positive."""
         self.check_tensor(name, value, *size)
@@ -300,7 +312,7 @@ class ControlStep(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, sim: Simulator, slot: int, *start: torch.Tensor) -> torch.Tensor:
-        ctx.sim, ctx.slot, ctx.version = sim, slot, sim._versions[slot]
+        ctx.sim, ctx.slot, ctx.version = sim, slot, sim._window.version(slot)
         return sim._forward(slot, *start)
 
     @staticmethod
@@ -311,11 +323,7 @@ class ControlStep(torch.autograd.Function):
                 "a simulated step has a first derivative only, so no create_graph=True: take finite differences of it"
             )
         sim = ctx.sim
-        if sim._versions[ctx.slot] != ctx.version:
-            raise RuntimeError(
-                f"backward through a control step whose checkpoint was overwritten: at most {sim.horizon} "
-                "differentiable steps can be alive; build the simulator with a larger horizon"
-            )
+        sim._window.check(ctx.slot, ctx.version)
         try:
             sim._g_end.copy_(g_end)
         except RuntimeError as error:  # is_grads_batched

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from diffsim.robot.elements import at_rest, muscles
-from diffsim.robot.scene import Array
+from diffsim.robot.types import Array
 from diffsim.tasks.locomotion import Locomotion
 
 VECTOR = (1.0, -1.0, 1.0)  # of a velocity

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeAlias
+
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from diffsim.symmetry.mirror import Reflection
+from diffsim.symmetry.mirror import Mirror, Reflection
 from diffsim.training.errors import fail
 from diffsim.training.layers import First, ObsNormalizer, moments
+
+Network: TypeAlias = nn.Sequential | nn.ModuleList
 
 
 class WithMirrorImage(nn.Module):
@@ -45,7 +50,36 @@ class SymmetricParameter(WithMirrorImage):
         return (x + x.index_select(-1, self.index)) / 2
 
 
-def mirror_inputs(network: nn.Sequential | nn.ModuleList, reflection: Reflection) -> None:
+def make_alike(
+    mirror: Mirror,
+    actor: nn.Module,
+    inputs: Sequence[Network | None],
+    action: Network,
+    value: Network,
+    size: Network | None = None,
+) -> None:
+    """Treat left and right alike: mirrored states get mirrored actions with the same noise, and the same value.
+
+    Args:
+        mirror: the task's.
+        actor: has a `normalizer` of observations and a parameter `log_std`, a number per action.
+        inputs: the networks that observations enter; None is left out.
+        action, value, size: those that end with actions, values, and numbers per action that have no direction.
+    """
+    normalizer = actor.get_submodule("normalizer")
+    assert isinstance(normalizer, ObsNormalizer)
+    mirror_statistics(normalizer, mirror.obs)
+    for network in inputs:
+        if network is not None:
+            mirror_inputs(network, mirror.obs)
+    mirror_outputs(action, mirror.action)
+    mirror_outputs(value, mirror.value)
+    if size is not None:
+        mirror_outputs(size, mirror.size)
+    mirror_parameter(actor, "log_std", mirror.action)
+
+
+def mirror_inputs(network: Network, reflection: Reflection) -> None:
     """Let a network of observations see their mirror images as well.
 
     Raises:
@@ -59,7 +93,7 @@ def mirror_inputs(network: nn.Sequential | nn.ModuleList, reflection: Reflection
     network.insert(0 if columns is None else 1, WithMirrorImage(len(index), index, sign))
 
 
-def mirror_outputs(network: nn.Sequential | nn.ModuleList, reflection: Reflection) -> None:
+def mirror_outputs(network: Network, reflection: Reflection) -> None:
     """Let a network after `mirror_inputs` end with the mean of its output and the image of that for the image."""
     network.append(MirrorMean(len(reflection.index), reflection.index, reflection.sign))
 

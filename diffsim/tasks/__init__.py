@@ -21,9 +21,9 @@ REGISTERED = {
     "swimmer": "diffsim_robots.swimmer:Swimmer",
     "walker": "diffsim_robots.walker:Walker",
     "humanoid_imitation": "diffsim_robots.imitation.task:HumanoidImitation",
-    "go1": "diffsim_robots.joystick:Go1",
-    "go2": "diffsim_robots.joystick:Go2",
-    "g1": "diffsim_robots.joystick:G1",
+    "go1": "diffsim_robots.unitree:Go1",
+    "go2": "diffsim_robots.unitree:Go2",
+    "g1": "diffsim_robots.unitree:G1",
     "g1_track": "diffsim_robots.imitation.tracking:G1Track",
 }
 
@@ -61,6 +61,8 @@ def find_task(name: str | type[Task]) -> type[Task]:
     if FILE.fullmatch(str(name)):
         return pkgutil.resolve_name(OWN_TASK)(name)
     base, options = base_name(str(name)), str(name).partition(":")[2]
+    if base.endswith(".xml"):
+        raise TaskError(f"{base} is a robot without a task: give a file with a class, my_task.py (docs/own_robot.md)")
     if base not in TASKS:
         raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
     return TASKS[base] if name == base else TASKS[base].configured(options)

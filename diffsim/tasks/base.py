@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import pkgutil
 import sys
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
@@ -28,6 +29,8 @@ from diffsim.sim.integration import TOLERANCE, Contact, Integration, check_conta
 
 Accuracy = Literal["fast", "default", "accurate"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
+Parts: TypeAlias = tuple[tuple[str, int], ...]  # names and sizes
+Defaults: TypeAlias = Mapping[str, Mapping[str, Any]]
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
 OPTIONS = "diffsim_robots.variation:configure"  # reads options after a task's name
 OWN_TASK = "diffsim.tasks.own_task"  # checks tasks outside this package, centres actions
@@ -44,6 +47,21 @@ class Task:
 
     docs/own_robot.md lists the attributes and their defaults. An episode starts uniformly in start +- spread / 2, where
     both list qpos, then qvel.
+
+    Example:
+        class Forward(diffsim.Task):
+            name, asset = "forward", "robot.xml"
+
+            def observe(self, qpos, qvel, action):
+                return torch.cat((qpos[..., 1:], qvel), dim=-1)
+
+            def reward(self, obs, action):
+                return obs[..., 5]                                        # m/s
+
+        env = diffsim.make(Forward, num_envs=4)
+
+    Raises:
+        TaskError: by `make`, of a task that does not fit its robot.
     """
 
     name: ClassVar[str] = "task"
@@ -55,7 +73,11 @@ class Task:
     num_random: int  # random numbers per reset
     forward_column: int | None  # of qpos [m], grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
-    obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
+    obs_parts: ClassVar[Parts] = ()  # of the observation, for `named` and `export`; empty: unnamed
+    memory_parts: ClassVar[Parts] = ()  # of the memory, for `recall`
+    like: ClassVar[str | None] = None  # a task of the paper, with whose settings learners begin
+    defaults: ClassVar[Defaults] = {}  # of learners' flags, by script, "shac", and by script and device, "shac gpu"
+    initial_gain: ClassVar[float] = 1.0  # factor of an actor's last weights at first; below 1: small actions (mlp)
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
     mirrored_by: ClassVar[str | None] = None  # "module:function" that makes its `mirror`
     varied_by: ClassVar[str | None] = None  # "module:Class" of what a training changes, see diffsim_robots/variation.py
@@ -77,10 +99,24 @@ class Task:
 
     @classmethod
     def load_robot(cls) -> Scene:
-        """Load the robot of the asset.
+        """Load the robot of the asset; override it to change the robot.
+
+        Example:
+            from diffsim.robot.pairs import with_pairs
+
+            class Touching(diffsim.Task):
+                name = "touching"
+
+                @classmethod
+                def load_robot(cls):
+                    return with_pairs(diffsim.load_scene("robot.xml"))    # its parts touch each other
 
         A file of diffsim's tasks is in diffsim/assets. Another task's is searched next to the file of the class that
         names it, in the working directory and in diffsim/assets.
+
+        Raises:
+            TaskError: there is no asset, or no such file.
+            SceneError: the robot cannot be simulated.
         """
         owner = next((kind for kind in cls.__mro__ if "asset" in vars(kind)), cls).__module__
         asset: Asset | None = getattr(cls, "asset", None)
@@ -229,6 +265,14 @@ class Task:
         """
         return memory
 
+    def named(self, obs: Tensor) -> dict[str, Tensor]:
+        """Return the parts of observations (..., obs_dim) by the names of obs_parts."""
+        return split(obs, self.obs_parts)
+
+    def recall(self, memory: Tensor) -> dict[str, Tensor]:
+        """Return the parts of memory (..., num_memory) by the names of memory_parts."""
+        return split(memory, self.memory_parts)
+
     def ghost(self, memory: Tensor) -> Tensor | None:
         """Return the world qpos (..., nq) that the robot should track, for videos and pages, or None."""
         return None
@@ -247,6 +291,10 @@ class Task:
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Return the reward (...) of action (..., nu), clipped to [-1, 1], which led to obs (..., obs_dim)."""
         raise NotImplementedError
+
+    def reward_terms(self, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
+        """Return the weighted terms (...) whose sum is the reward, by name; evaluations log them. None by default."""
+        return {}
 
     def terminated(self, obs: Tensor) -> Tensor:
         """Return bool (...), true where the robot has fallen or the task is over."""
@@ -267,6 +315,17 @@ class Planar(Task):
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         return torch.cat((qpos[..., self.places :], qvel), dim=-1)
+
+
+def width(parts: Parts) -> int:
+    """Return the number of columns of all parts."""
+    return sum(size for _, size in parts)
+
+
+def split(values: Tensor, parts: Parts) -> dict[str, Tensor]:
+    """Return the columns (..., size) of each part of values (..., width) by its name."""
+    names, sizes = zip(*parts, strict=True)
+    return dict(zip(names, values.split(sizes, dim=-1), strict=True))
 
 
 def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:

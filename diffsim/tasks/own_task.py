@@ -23,7 +23,8 @@ from torch import Tensor
 from diffsim.robot.actuator import joints_of
 from diffsim.robot.elements import control_range, home_key, label, listed, servos
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 from diffsim.sim.integration import is_real
 from diffsim.tasks import FILE, Task, TaskError
 from diffsim.tasks.base import OURS

@@ -111,18 +111,6 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def find_nonfinite(learner: Learner) -> str | None:
-    """The first weight that is not finite, if any. Frozen ones may be infinite: log_std of a policy without noise."""
-    for owner, module in (parts(learner) | {"policy": learner.policy}).items():
-        for name, weight in (
-            (*module.named_parameters(), *module.named_buffers()) if isinstance(module, nn.Module) else ()
-        ):
-            frozen = isinstance(weight, nn.Parameter) and not weight.requires_grad
-            if bool((weight.isnan() if frozen else ~weight.isfinite()).any()):
-                return f"{owner}.{name}"
-    return None
-
-
 def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, Any]:
     """The checkpoint at path, or of the run whose folder that is, whole, of this format and of the script if one is
     named; else raises ValueError."""
@@ -152,7 +140,24 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
 
 
 def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
-    """The policy of any script's checkpoint, on the CPU in float32; raises ValueError as `load` does."""
+    """Read the policy of any script's checkpoint, without noise, on the CPU in float32; no code of the file runs.
+
+    Example:
+        from diffsim.training import load_policy
+        from diffsim.training.checkpoint import POLICIES
+        policy = load_policy(POLICIES / "ant.pt").network       # or runs/<run>/checkpoint.pt
+        action = policy(torch.zeros(64, 37))                    # (64, 8) in [-1, 1]
+
+    Args:
+        path: checkpoint, or what `diffsim export` wrote.
+
+    Returns:
+        `network`, an nn.Module from observations (..., obs_dim) of the actor to actions (..., nu), and the `args`,
+        `script` and `iteration` of its training.
+
+    Raises:
+        ValueError: the file is missing, broken or no checkpoint.
+    """
     state = load(path)
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated

@@ -1,29 +1,83 @@
-"""The directory of a run: progress.csv, tensorboard and a progress bar."""
+"""The directory of a run, which no other process uses meanwhile."""
 
 from __future__ import annotations
 
-import csv
 import errno
 import itertools
-import math
 import os
 import socket
-import sys
 import tempfile
 import time
-from collections import deque
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn, TextIO
-
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
+from typing import TextIO
 
 from diffsim.training.errors import fail
 
-# The first columns of every progress.csv.
-COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return", "eval_length", "eval_speed")
+RUNS = Path("runs")  # parent of runs without --run-dir
+
+
+class RunDirectory:
+    """Made and locked when the run begins: one that fails at its start leaves nothing behind.
+
+    Args:
+        path: None: a new one in RUNS.
+        resumed: the checkpoint that the run continues.
+
+    Attributes:
+        saved: iteration of its checkpoint.
+    """
+
+    def __init__(self, path: Path | None, resumed: Path | None) -> None:
+        self.path, self.resumed, self.saved = path or RUNS, resumed, 0
+        self._chosen = path is not None
+        self._lock: TextIO | None = None
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file in which the run is saved."""
+        return self.path / "checkpoint.pt"
+
+    def check(self) -> None:
+        """End the script if the run cannot be written there; otherwise nothing changes, except that a resumed run's
+        directory is locked before its checkpoint is read."""
+        check_writable(self.path)
+        self._check_unused()
+        if self.resumed and self.path.is_dir():
+            self._lock = lock(self.path)
+
+    def open(self, name: str) -> Path:
+        """Make and lock it, under this name unless a path was given, and return its path."""
+        with self.writing():
+            if not self._chosen:
+                self.path, self._chosen = make_unused(self.path / name), True
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = self._lock or lock(self.path)
+        self._check_unused()  # again: a run may have ended there since this one started
+        return self.path
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Around what writes files: a full disk or the like ends the script."""
+        try:
+            yield
+        except OSError as error:
+            fail(f"cannot write to {self.path}: {error.strerror}; {self.kept()}")
+
+    def kept(self) -> str:
+        """Say what of the run is saved."""
+        path = self.checkpoint
+        return f"{path} is of iteration {self.saved}" if path.is_file() else "no checkpoint was saved"
+
+    def close(self) -> None:
+        """Leave it to others."""
+        if self._lock is not None:
+            self._lock.close()
+
+    def _check_unused(self) -> None:
+        if self.checkpoint.exists() and (self.resumed is None or not self.resumed.samefile(self.checkpoint)):
+            fail(f"{self.path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
 
 
 def check_writable(directory: Path) -> None:
@@ -69,116 +123,3 @@ def lock(directory: Path) -> TextIO:
     file.truncate(0)
     print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
     return file
-
-
-class EpisodeStatistics:
-    """Mean return and length of the last finished episodes: of the newest rollouts that hold a hundred of them."""
-
-    def __init__(self) -> None:
-        self.rollouts: deque[tuple[float, float, float]] = deque()  # episodes finished, sums of return and of length
-
-    def add(self, count: float, total_return: float, total_length: float) -> None:
-        if count > 0:
-            self.rollouts.append((count, total_return, total_length))
-        while len(self.rollouts) > 1 and sum(rollout[0] for rollout in self.rollouts) - self.rollouts[0][0] >= 100:
-            self.rollouts.popleft()
-
-    def means(self) -> tuple[float, float]:
-        """Once an episode has ended."""
-        count, total_return, total_length = (sum(column) for column in zip(*self.rollouts, strict=True))
-        return total_return / count, total_length / count
-
-
-class ProgressFile:
-    """progress.csv: a row per iteration, a column per scalar. Columns may join later; older rows leave them empty.
-
-    A resumed run goes on after its iteration, and rows of later ones are dropped; iteration 0 begins a new file.
-    """
-
-    def __init__(self, path: Path, iteration: int) -> None:
-        self.path, self.columns = path, list(COLUMNS)
-        self._replace(iteration)
-
-    def write(self, row: Mapping[str, float]) -> None:
-        new = [name for name in row if name not in self.columns]
-        if new or not self.path.is_file():  # someone may have moved it
-            self._replace(math.inf, new)
-        with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, self.columns, restval="").writerow(row)
-
-    def _replace(self, last: float, new: Sequence[str] = ()) -> None:
-        """Replace the file in one step: its rows up to an iteration, with new columns.
-
-        A crash may have left rows of later iterations, and half of a line.
-        """
-        rows = list[dict[str, str]]()
-        if last > 0 and self.path.is_file():
-            with self.path.open(newline="") as file:
-                reader = csv.DictReader(file)
-                self.columns = list(reader.fieldnames or COLUMNS)
-                rows = [row for row in reader if None not in row.values() and int(row["iteration"]) <= last]
-        self.columns += new
-        temporary = self.path.with_suffix(".csv.tmp")
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self.columns, restval="")
-            writer.writeheader()
-            writer.writerows(rows)
-        os.replace(temporary, self.path)
-
-
-def column(scalar: str) -> str:
-    """The column of progress.csv for a scalar of tensorboard: eval/return -> eval_return."""
-    return scalar.removeprefix("charts/episodic_").replace("/", "_")
-
-
-class Screen:
-    """Stdout for as long as someone reads it; what trains goes on without."""
-
-    def write(self, text: str) -> None:
-        with suppress(OSError):
-            print(text, end="", flush=True)
-
-    def flush(self) -> None:
-        """`write` does it."""
-
-
-SCREEN = Screen()
-
-
-def say(text: object) -> None:
-    """Print a line, above the progress bar if there is one."""
-    tqdm.write(str(text), file=SCREEN)
-
-
-class ProgressLog:
-    """The three of them for one run. A resumed run goes on after iteration and control_steps, which are 0 otherwise."""
-
-    def __init__(
-        self, directory: Path, iteration: int, control_steps: int, args: Mapping[str, object], total: int, quiet: bool
-    ) -> None:
-        self.file = ProgressFile(directory / "progress.csv", iteration)
-        self.tensorboard = SummaryWriter(str(directory), purge_step=control_steps + 1 if iteration else None)
-        table = "\n".join(f"|{name}|{value}|" for name, value in args.items())
-        self.tensorboard.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}")
-        self.total, self.quiet = total, quiet
-        self.bar: tqdm[NoReturn] | None = None
-
-    def write(self, iteration: int, control_steps: int, seconds: float, scalars: Mapping[str, float]) -> None:
-        self.file.path.parent.mkdir(parents=True, exist_ok=True)  # someone may have moved it
-        for key, value in scalars.items():
-            self.tensorboard.add_scalar(key, value, control_steps)
-        row = {"iteration": iteration, "control_steps": control_steps, "seconds": round(seconds, 3)}
-        self.file.write(row | {column(key): float(f"{value:.7g}") for key, value in scalars.items()})
-        if self.quiet:
-            return
-        if self.bar is None:  # after the first iteration, which compiled and says nothing about the rest
-            interval = 0.1 if sys.stdout is not None and sys.stdout.isatty() else 10.0
-            self.bar = tqdm(total=self.total, initial=iteration, file=SCREEN, mininterval=interval, ncols=100)
-        self.bar.update(iteration - self.bar.n)
-        if "charts/episodic_return" in scalars:
-            self.bar.set_postfix_str(f"return {scalars['charts/episodic_return']:.1f}", refresh=False)
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-        self.tensorboard.close()

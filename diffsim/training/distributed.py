@@ -10,6 +10,8 @@ import torch.distributed as dist
 
 from diffsim.training import graph
 
+RANK_SEED = 1_000_003  # between the seeds of two ranks
+
 
 def choose_device(device: str) -> str:
     """The device of this process: of several ranks each takes its own GPU."""
@@ -37,6 +39,16 @@ def rank() -> int:
 
 def size() -> int:
     return dist.get_world_size() if dist.is_initialized() else int(os.environ.get("WORLD_SIZE", 1))
+
+
+def own_seed(seed: int) -> int:
+    """Return this rank's seed: ranks draw different random numbers."""
+    return seed + rank() * RANK_SEED
+
+
+def generator(device: torch.device) -> torch.Generator:
+    """Return the generator of a device from which torch draws by default."""
+    return torch.cuda.default_generators[device.index] if device.type == "cuda" else torch.default_generator
 
 
 def average(tensor: torch.Tensor) -> torch.Tensor:

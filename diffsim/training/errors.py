@@ -8,14 +8,13 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
-from itertools import groupby
 from typing import NoReturn
 
 import torch
 
 from diffsim.env import ActionError
-from diffsim.robot.scene import SceneError
-from diffsim.robot.terrain import TerrainError
+from diffsim.robot.profile import TerrainError
+from diffsim.robot.types import SceneError
 from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError
 from diffsim.tasks import TaskError
@@ -33,7 +32,6 @@ EXPECTED = (
 
 HELP = {"-h", "--help"}
 WIDE = "100000"  # columns of a terminal in which no word is split
-RULE = re.compile("[─-]+")  # between the parts of a box
 
 
 @contextmanager
@@ -52,8 +50,8 @@ def in_one_line(words: Sequence[str] | None) -> Iterator[None]:
         if not end.code:  # --help
             raise
         rows = re.sub(r"\x1b\[[\d;]*m", "", box.getvalue()).splitlines()[1:-1]  # without colours, title and border
-        parts = groupby((" ".join(row.strip("│").split()) for row in rows), RULE.fullmatch)
-        told = ("" if rule else " ".join(part).strip(" .") for rule, part in parts)
+        parts = re.split("^[─-]+$", "\n".join(row.strip("│ ") for row in rows), flags=re.MULTILINE)
+        told = (" ".join(part.split()).strip(" .") for part in parts)
         fail("; ".join(part for part in told if part and not part.startswith("Argument helptext")))
     else:
         sys.stderr.write(box.getvalue())  # warnings

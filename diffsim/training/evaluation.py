@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import json
 import pkgutil
 from collections.abc import Callable
@@ -21,9 +20,10 @@ import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.training import checkpoint, graph
-from diffsim.training.directory import check_writable, say
+from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
+from diffsim.training.log import say
 
 GAIT = "diffsim_cli.gait:report"
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
@@ -48,6 +48,7 @@ class Evaluation:
     control_dt: float  # s
     others: dict[str, float] = field(default_factory=dict)  # what else a script measured, by name
     ghost: Tensor | None = None  # (T, n, nq) what was to be tracked, before each step; see Task.ghost
+    terms: dict[str, float] = field(default_factory=dict)  # of the mean return, by name; see Task.reward_terms
 
     @property
     def length(self) -> float:
@@ -56,6 +57,7 @@ class Evaluation:
     def scalars(self) -> dict[str, float]:
         values = {"eval/return": self.returns.median().item(), "eval/length": self.length}
         values |= {} if self.speed is None else {"eval/speed": self.speed}
+        values |= {f"eval/reward_{name}": value for name, value in self.terms.items()}
         return values | {f"eval/{name}": value for name, value in self.others.items()}
 
     def __str__(self) -> str:
@@ -96,6 +98,8 @@ class Player:
         self.obs = torch.zeros(env.num_envs, env.task.obs_dim, dtype=env.dtype, device=env.device)
         self.returns, self.lengths = torch.zeros_like(self.obs[:, 0]), torch.zeros_like(env.episode_step)
         self.alive = torch.ones_like(self.lengths, dtype=torch.bool)
+        terms = env.task.reward_terms(self.obs, self.obs.new_zeros(env.num_envs, env.scene.nu))
+        self.terms = {name: torch.zeros_like(self.returns) for name in terms}  # of the returns
         self.step = graph.capture(self._step, env.device, env) if self.captured else self._step
         self.patience = LOOK_EVERY if env.device.type == "cuda" else 1
 
@@ -108,8 +112,10 @@ class Player:
 
     def _step(self) -> Tensor:
         action = self.policy(self.obs)
-        obs, reward, terminated, truncated, _ = self.env.step(action)
+        obs, reward, terminated, truncated, info = self.env.step(action)
         self.obs.copy_(obs)
+        for name, term in self.env.task.reward_terms(info["final_obs"], action.clamp(-1.0, 1.0)).items():
+            self.terms[name] += torch.where(self.alive & ~info["nonfinite"], term, torch.zeros_like(term))
         self.returns += torch.where(self.alive, reward, torch.zeros_like(reward))
         self.lengths += self.alive
         self.alive &= ~(terminated | truncated)
@@ -123,6 +129,8 @@ class Player:
         self.obs.copy_(env.reset(seed=seed)[0])
         self.returns.zero_()
         self.lengths.zero_()
+        for total in self.terms.values():
+            total.zero_()
         self.alive.fill_(True)
         while len(path) % self.patience or self.alive.any():
             path.append(env.qpos.clone())
@@ -138,7 +146,8 @@ class Player:
         missed = env.sim.unconverged.sum().item()
         others = {"unconverged": missed} if missed else {}  # control steps, of Newton's method
         followed = torch.stack(ghosts[: len(qpos)]) if ghosts else None
-        return Evaluation(returns, lengths, speed, qpos, action, env.scene, env.control_dt, others, followed)
+        terms = {name: total.mean().item() for name, total in self.terms.items()}
+        return Evaluation(returns, lengths, speed, qpos, action, env.scene, env.control_dt, others, followed, terms)
 
 
 def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED) -> Evaluation:
@@ -166,7 +175,7 @@ def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, see
     options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
     options["threads"] = args.threads or None
     try:
-        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options | others)
+        return diffsim.make(args.task_class, num_envs, args.device, seed, horizon, **options | others)
     except ValueError as error:
         fail(error)
 
@@ -210,8 +219,9 @@ def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluatio
     """
     if not evaluation.compared:
         return {}
-    own, substeps = evaluation.returns.median().item(), FINER * args.substeps
-    value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
+    own, substeps, finer = evaluation.returns.median().item(), FINER * args.substeps, copy.copy(args)
+    finer.substeps, finer.implicit = substeps, False
+    value = measure(finer).returns.median().item()
     share = kept(own, value)
     say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{_warning(share, 'more substeps')}")
     found = {"finer": {"substeps": substeps, "return": value, "kept": share}}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -12,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import torch
 import tyro
 
-from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
+from diffsim.tasks import FILE, TASKS, Accuracy, Contact, Task, base_name, find_task
 from diffsim.training import checkpoint
 from diffsim.training.errors import fail, in_one_line
 from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, flag
@@ -76,9 +77,23 @@ class Flags:
         """The task's name without options: tables of defaults are by it."""
         return base_name(self.env)
 
+    @functools.cached_property
+    def task_class(self) -> type[Task]:
+        """The task: a file's code runs once, and options are read once."""
+        return find_task(self.env)
+
+    @property
+    def like(self) -> str:
+        """The name of the task whose settings it begins with: Task.like, or its own."""
+        like = self.task_class.like
+        return self.task if like is None else find_task(like).name
+
     def task_defaults(self) -> dict[str, Any]:
-        """Return defaults that depend on other flags, such as the task, the device or the preset."""
-        return {"symmetric": find_task(self.env).symmetric} if hasattr(self, "symmetric") else {}
+        """Return the learner's defaults that depend on other flags, such as the task, the device or the preset.
+
+        What the task itself sets (Task.defaults, Task.symmetric) replaces them.
+        """
+        return {}
 
     def check(self) -> None:
         """Raise a ValueError where arguments do not fit together; flags that several scripts have are checked here."""
@@ -86,7 +101,7 @@ class Flags:
             fail("--implicit is for --contact soft, and the contact is MuJoCo's")
         if self.contact != "mujoco" and any(self.onset):
             fail(f"--onset is for --contact mujoco, and the contact is {self.contact}")
-        if getattr(self, "symmetric", False) and not find_task(self.env).has_mirror():
+        if getattr(self, "symmetric", False) and not self.task_class.has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
 
     @classmethod
@@ -120,10 +135,11 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         except (AttributeError, KeyError, TypeError) as error:
             fail(f"{path} is damaged: {error}")
     else:
-        task = find_task(args.env)
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
-            args.contact = task.contact
-        defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
+            args.contact = args.task_class.contact
+        defaults = dataclasses.replace(
+            kind(), contact=args.contact, **(_presets(args) | args.task_defaults() | _of_task(args))
+        )
         args = _cli(kind, argv, defaults)
     check_ranges(args)
     (Flags.check if args.evaluate else kind.check)(args)  # an evaluation skips checks that concern training
@@ -135,11 +151,23 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 def _presets(args: Flags) -> dict[str, Any]:
     """Look up what --accuracy and --contact stand for."""
     try:
-        how = find_task(args.env).integration(args.accuracy, args.contact)
+        how = args.task_class.integration(args.accuracy, args.contact)
     except ValueError as error:
         fail(error)
     onset = {} if how.contact == "mujoco" else {"onset": (0.0, 0.0)}
     return {"substeps": how.substeps, "implicit": how.implicit} | onset
+
+
+def _of_task(args: Flags) -> dict[str, Any]:
+    """Look up the defaults that the task sets for this script, on this device."""
+    task, script, device = args.task_class, args.script(), "cpu" if args.device == "cpu" else "gpu"
+    values = {"symmetric": task.symmetric} if hasattr(args, "symmetric") else {}
+    if wrong := [key for key, given in task.defaults.items() if not isinstance(given, Mapping)]:
+        fail(f"task {args.env!r}: defaults are by script, such as {{'shac': {{'horizon': 16}}}}, not {wrong[0]!r}")
+    values |= {**task.defaults.get(script, {}), **task.defaults.get(f"{script} {device}", {})}
+    if unknown := ", ".join(flag(name) for name in values if not hasattr(args, name)):
+        fail(f"task {args.env!r} has defaults of flags that {script}.py lacks: {unknown}")
+    return values
 
 
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:

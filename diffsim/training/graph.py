@@ -1,8 +1,7 @@
-"""Capture a function into a CUDA graph, and time it; on the CPU there is nothing to capture."""
+"""Capture a function into a CUDA graph; on the CPU there is nothing to capture."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 from weakref import WeakSet
@@ -16,22 +15,6 @@ Result = TypeVar("Result")
 # Calls that run eagerly before the capture: they compile kernels, allocate optimiser state and pick algorithms.
 WARMUP = 2
 _captured: WeakSet[torch.cuda.CUDAGraph] = WeakSet()
-
-
-class Mark:
-    """A moment in a device's work, which goes on."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.time, self.event = time.perf_counter(), None
-        if device.type == "cuda":
-            self.event = torch.cuda.Event(enable_timing=True)
-            self.event.record(torch.cuda.current_stream(device))
-
-    def since(self, earlier: Mark) -> float:
-        """Seconds from an earlier mark to this one, whose work is done."""
-        if self.event is not None and earlier.event is not None:
-            return earlier.event.elapsed_time(self.event) / 1e3
-        return self.time - earlier.time
 
 
 def capture(

@@ -65,11 +65,13 @@ def mlp(
     norm: bool = False,
     orthogonal: bool = False,
     columns: int | None = None,
+    gain: float = 1.0,
 ) -> Chain:
     """Stack linear, activation and, if asked for, LayerNorm per hidden layer, and a linear output unless it is None.
 
-    Weights are initialised as torch does, or orthogonal with gain sqrt(2) and zero biases. The network sees the first
-    columns of its inputs only, or all of them (None).
+    Weights are initialised as torch does, or orthogonal with gain sqrt(2) and zero biases. A gain other than 1 then
+    multiplies the last layer's weights, and its bias is zero. The network sees the first columns of its inputs only, or
+    all of them (None).
     """
     layers = list[nn.Module]()
     if columns is not None:
@@ -82,6 +84,10 @@ def mlp(
         if isinstance(layer, nn.Linear):
             nn.init.orthogonal_(layer.weight, 2**0.5)
             nn.init.zeros_(layer.bias)
+    if gain != 1.0:
+        with torch.no_grad():
+            layers[-1].get_parameter("weight").mul_(gain)
+            layers[-1].get_parameter("bias").zero_()
     return Chain(*layers)
 
 

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from diffsim.env import DiffEnv
-from diffsim.robot.scene import Array
+from diffsim.robot.types import Array
 from diffsim.tasks import Task
 from diffsim.tasks.locomotion import Locomotion
 from diffsim_cli.drive import web

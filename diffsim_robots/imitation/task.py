@@ -78,6 +78,7 @@ class HumanoidImitation(Imitation):
     """
 
     name = "humanoid_imitation"
+    like: ClassVar[str | None] = "humanoid"
     asset = Humanoid.asset
     contact: ClassVar[Contact] = Humanoid.contact
     substeps, fast = Humanoid.substeps, Humanoid.fast

@@ -7,19 +7,20 @@ data: a subclass with its file, the names of its sides and the number of its joi
 from __future__ import annotations
 
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 from diffsim.symmetry.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
-from diffsim.tasks.base import Contact, TaskError
+from diffsim.tasks.base import Contact, Defaults, TaskError, width
 from diffsim.tasks.locomotion import rotate
 from diffsim_cli.gait import trace
-from diffsim_robots.common import push, score
+from diffsim_robots.common import add_up, push, score
 from diffsim_robots.imitation.clip import FASTEST, Clip
 from diffsim_robots.imitation.kinematics import difference
 from diffsim_robots.imitation.task import STRAY, Imitation, draw
@@ -33,7 +34,31 @@ BEFORE_END = 60  # frames, at least, that an episode has of its clip, if this is
 AHEAD = 3  # frames, how much earlier the reference is seen
 SLIPPING = 2.5  # recorded feet slip less than a third of what they seem to with another order of the quaternion
 STILL = 0.01  # m/s of the feet, below which a clip may stand still in any order
+WEIGHTS = {  # of the reward's terms; see reward_terms. A weight of 0 switches a term off
+    "alive": 3.0,  # a perfect step's reward
+    "root_position": -0.5,
+    "root_rotation": -0.4,
+    "joint_position": -0.5,
+    "joint_velocity": -0.1,
+    "root_velocity": -0.15,
+    "action_rate": -0.02,
+}
+ORDER = (  # of additions, see add_up
+    ("alive",),
+    ("root_position", "root_rotation"),
+    ("joint_position", "joint_velocity"),
+    ("root_velocity", "action_rate"),
+)
 TURNED = 1.0  # rad; the episode ends when the root is turned from the reference's by more
+# Learners begin near the reference pose, with little noise: more throws the robot over.
+BEGIN: dict[str, Any] = {
+    "critic_hidden": (512, 256),
+    "critic_lr": 1e-3,
+    "target_alpha": 0.9,
+    "initial_log_std": -2.0,
+    "adjoint_clip": 5.0,
+    "horizon": 16,
+}
 
 
 def slip(depth: Array, slide: Array) -> float:
@@ -44,9 +69,10 @@ def slip(depth: Array, slide: Array) -> float:
 class Tracking(Imitation):
     """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates).
 
-    A clip is played once; its last frame is held. Memory: the frame, the last two actions, a push that is due.
+    A clip is played once; its last frame is held. Memory: memory_parts; a push is due in the next step.
 
     Attributes:
+        weights: of the reward's terms, by name.
         motions: the first frame of each motion, and how many control steps it lasts, int64 on the CPU.
         low, high: (joints,) rad, between which the servos' targets are.
     """
@@ -60,6 +86,7 @@ class Tracking(Imitation):
     forward_column = None  # what counts is the reference
     varied_by = "diffsim_robots.variation:Variation"
     ranges: ClassVar[Ranges] = {"friction": (0.7, 1.3), "push": (0.0, 0.5)}
+    weights: ClassVar[dict[str, float]] = WEIGHTS
     disturbances: Ranges = {"push": (0.0, 0.0)}  # m/s, how large those are that come at random
 
     def __init_subclass__(cls) -> None:
@@ -69,8 +96,8 @@ class Tracking(Imitation):
         root = "velocity gravity root_off reference_velocity reference_ahead root_turned angular_velocity".split()
         each = "joints_off rates_off_x0.1 joints joint_rates_x0.1 last_action action_change joints_ahead".split()
         cls.obs_parts = *((name, 3) for name in root), *((name, cls.joints) for name in each)
-        cls.obs_dim = sum(size for _, size in cls.obs_parts)
-        cls.num_memory, cls.num_noise = 3 + 2 * cls.joints, 3
+        cls.memory_parts = ("frame", 1), ("last_action", cls.joints), ("action_before", cls.joints), ("push", 2)
+        cls.obs_dim, cls.num_memory, cls.num_noise = width(cls.obs_parts), width(cls.memory_parts), 3
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         super().__init__(device, dtype)
@@ -149,15 +176,18 @@ class Tracking(Imitation):
         return torch.cat((step, torch.zeros_like(step).expand(*step.shape[:-1], self.num_memory - 1)), dim=-1)
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
-        step, last, _, _ = memory.split((1, self.joints, self.joints, 2), dim=-1)
+        held = self.recall(memory)
+        step = held["frame"]
         step = torch.minimum(step + 1.0, self._ends[step.long()].to(step.dtype))
-        return torch.cat((step, action, last, push(noise, self.disturbances["push"], self.control_dt)), dim=-1)
+        return torch.cat(
+            (step, action, held["last_action"], push(noise, self.disturbances["push"], self.control_dt)), dim=-1
+        )
 
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Pushes, and the servos' targets: the joints of the reference's next frame, and up to REACH more or less."""
         target = self.reference(memory, 1)[0][..., 7:] + REACH * action
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        qvel = torch.cat((qvel[..., :2] + memory[..., -2:], qvel[..., 2:]), dim=-1)
+        qvel = torch.cat((qvel[..., :2] + self.recall(memory)["push"], qvel[..., 2:]), dim=-1)
         return qvel, ((target - middle) / half).clamp(-1.0, 1.0)
 
     def program(self, policy: nn.Module) -> tuple[nn.Module, dict[str, tuple[int, ...]], list[str]]:
@@ -188,9 +218,9 @@ class Tracking(Imitation):
         return dict(clip_name=str(self.clip), reference_frames=",".join(map(str, range(1 + AHEAD))))
 
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
-        _, last, before, _ = memory.split((1, self.joints, self.joints, 2), dim=-1)
+        held = self.recall(memory)
         (target, speed), (later, _) = self.reference(memory), self.reference(memory, AHEAD)
-        return self.see(qpos, qvel, last, before, target, speed, later)
+        return self.see(qpos, qvel, held["last_action"], held["action_before"], target, speed, later)
 
     def see(
         self, qpos: Tensor, qvel: Tensor, last: Tensor, before: Tensor, target: Tensor, speed: Tensor, later: Tensor
@@ -214,19 +244,27 @@ class Tracking(Imitation):
         return torch.cat((root, turned, angular, *off, *own, later[..., 7:] - target[..., 7:]), dim=-1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """At most 3: the reference's root and joints, how they move, and even actions."""
-        body, each = obs[..., :21].unflatten(-1, (7, 3)), obs[..., 21:].unflatten(-1, (7, self.joints))
-        velocity, _, off, speed, _, turned, _ = body.unbind(-2)
-        joints_off, rates_off, _, _, _, change, _ = each.unbind(-2)
-        place = 0.5 * score(off.square().sum(-1), 0.02) + 0.4 * score(turned.square().sum(-1), 0.1)
-        pose = 0.5 * score(joints_off.square().sum(-1), 0.5) + 0.1 * score(rates_off.square().sum(-1), 0.5)
-        motion = 0.15 * score((velocity - speed).square().sum(-1), 0.2) + 0.02 * change.square().sum(-1)
-        return 3.0 - place - pose - motion
+        return add_up(self.reward_terms(obs, action), ORDER)
+
+    def reward_terms(self, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
+        """The reference's root and joints, how they move, and even actions."""
+        part = self.named(obs)
+        speed = part["velocity"] - part["reference_velocity"]
+        terms = {
+            "alive": torch.ones_like(obs[..., 0]),
+            "root_position": score(part["root_off"].square().sum(-1), 0.02),
+            "root_rotation": score(part["root_turned"].square().sum(-1), 0.1),
+            "joint_position": score(part["joints_off"].square().sum(-1), 0.5),
+            "joint_velocity": score(part["rates_off_x0.1"].square().sum(-1), 0.5),
+            "root_velocity": score(speed.square().sum(-1), 0.2),
+            "action_rate": part["action_change"].square().sum(-1),
+        }
+        return {name: self.weights[name] * term for name, term in terms.items()}
 
     def terminated(self, obs: Tensor) -> Tensor:
         """The root strays from the reference or is turned from it."""
-        off, turned = obs[..., 6:9], obs[..., 15:18]
-        return (off.square().sum(-1) > STRAY**2) | (turned.square().sum(-1) > TURNED**2)
+        part = self.named(obs)
+        return (part["root_off"].square().sum(-1) > STRAY**2) | (part["root_turned"].square().sum(-1) > TURNED**2)
 
 
 class Program(nn.Module):
@@ -249,3 +287,14 @@ class G1Track(Tracking):
 
     name, asset, joints, sides = "g1_track", "g1.xml", 29, (("right_", "left_"),)
     default_clip = "g1_karate"
+    initial_gain = 0.01
+    defaults: ClassVar[Defaults] = {
+        "shac": BEGIN | {"num_envs": 1024, "iterations": 1500},
+        "rpo": BEGIN | {"num_envs": 256, "initial_log_std": -3.0, "epochs": 4, "trust": 0.5, "iterations": 400},
+        "rpo gpu": {"num_envs": 1024},
+        "sapo": BEGIN | {"adjoint_clip": 0.0, "target_entropy": (-1.0, -2.0), "iterations": 700},
+        "sapo gpu": {"num_envs": 1024, "critic_iterations": 8},
+        "sapo cpu": {"critic_hidden": (256, 128), "critic_iterations": 4, "iterations": 1300},
+        "ppo_baseline": {"hidden": (512, 256, 128), "horizon": 24, "initial_log_std": -1.0},
+        "ppo_baseline gpu": {"num_envs": 4096, "minibatch_size": 24576},
+    }

@@ -49,8 +49,8 @@ def test_a_picture_has_steps_for_all_and_seconds_for_those_alone():
     found["sapo", "hopper"] = [cells.curve([row | {"seconds": ""} for row in rows])]
     group = cells.Group("cpu", ("shac", "sapo"), ("hopper",), 2)
     steps, seconds = (paper.panel(group, found, "hopper", x) for x in ("control_steps", "seconds"))
-    assert [line.label for line in steps.lines] == ["", "", "shac", "", "sapo", "shac, published"]
-    assert [line.label for line in seconds.lines] == ["", "", "shac", "shac, published"]
+    assert [line.label for line in steps.lines] == ["", "", "SHAC", "", "SAPO", "SHAC, published"]
+    assert [line.label for line in seconds.lines] == ["", "", "SHAC", "SHAC, published"]
 
 
 def test_a_script_may_be_several_processes(tmp_path_factory, monkeypatch):

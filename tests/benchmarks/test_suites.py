@@ -10,10 +10,9 @@ import pfpn_sac
 import pytest
 import sac_baseline
 import sapo
-import stages
 import suites
 from common import RESULTS, ROOT
-from gps_variants import VariantArgs
+from guided_policy_search import VariantArgs
 from tables import read_csv
 
 import pfpn
@@ -23,8 +22,7 @@ import shac
 from diffsim.training import parse
 
 SCRIPTS = {
-    "benchmarks/gps_variants": VariantArgs,
-    "benchmarks/stages": stages.Args,
+    "benchmarks/guided_policy_search": VariantArgs,
     "mbpo": mbpo.Args,
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,

@@ -138,6 +138,7 @@ def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
         ("demo hopper", "no policy for hopper is shipped; there are: none"),
         ("train nothing --env ant", "unknown learner 'nothing': choose from bptt, gps, mbpo"),
         ("train", "Missing from diffsim train: {{bptt,gps,"),
+        ("check my_task.py", "my_task.py is code: check reads the MJCF file of the task's robot, its asset"),
         ("demo --nothing", "Unrecognized options: --nothing; For full helptext, run diffsim --help"),
         ("export {tmp}/nothing.pt {tmp}/new/out.pt", "no such checkpoint: {tmp}/nothing.pt"),
         ("export {trained} {trained}/out.pt", "File exists"),

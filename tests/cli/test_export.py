@@ -22,7 +22,7 @@ from diffsim_cli import commands as command
 from diffsim_robots.imitation import task as imitation
 from diffsim_robots.imitation.clip import Clip, read_clip
 from diffsim_robots.imitation.tracking import G1Track
-from diffsim_robots.joystick import Go1
+from diffsim_robots.unitree import Go1
 
 STATE: dict[str, Any] = {"args": {"env": "cartpole"}, "iteration": 1}
 

@@ -88,6 +88,17 @@ def test_numbers_of_a_robot(biped: Scene) -> None:
     assert robot["cost of transport"] == pytest.approx(50 * 0.12 / (11 * 9.81), rel=0.05)
 
 
+def test_lines_are_of_feet(biped: Scene) -> None:
+    """What lies or rolls is no foot, and only four feet have diagonals."""
+    qpos = steps_of(biped, (0.4, 0.2), (0.0, 0.5))
+    *feet, robot = gait.lines(gait.measure(biped, DT, [(qpos, np.zeros((len(qpos), 2)))]))
+    assert [line.split()[0] for line in feet] == ["right_leg", "left_leg"]
+    assert robot.startswith("robot") and "left-right 0.2" in robot and "diagonal" not in robot
+    qpos[:, 2], qpos[:, 7:9] = 0.995, 0.2  # on its wheel
+    lying = gait.measure(biped, DT, [(qpos, np.zeros((len(qpos), 2)))])
+    assert [*lying] == ["wheel", "robot"] and gait.lines(lying) == []
+
+
 def test_a_wheel_that_rolls_does_not_slip(biped: Scene) -> None:
     qpos = steps_of(biped, (0.0, 0.0), (0.0, 0.0))
     qpos[:, 0], qpos[:, 2], qpos[:, 7:9] = 0.1 * DT * np.arange(len(qpos)), 0.995, 0.2

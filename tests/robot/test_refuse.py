@@ -10,7 +10,7 @@ import pytest
 from scenes import FLOOR, MUSCLE, parse, pendulum, robot, tendon
 
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import SceneError
+from diffsim.robot.types import SceneError
 
 BALL = '<geom size="0.1"/>'
 MUSCLES = f"<muscle {MUSCLE}/>"

@@ -7,8 +7,9 @@ import pytest
 from scenes import CRANE, DISTINCT, ROBOTS, parse, pendulum, task_scene, without
 
 import diffsim
-from diffsim.robot.constraint import check_soft, constrained
-from diffsim.robot.scene import PENALTY_CONSTANTS, Scene, SceneError
+from diffsim.robot.constants import check_soft, constrained
+from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
+from diffsim.robot.types import SceneError
 
 
 def test_distinct_robots_have_every_feature() -> None:

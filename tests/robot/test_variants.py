@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scenes import free_states, parse, random_tree, robot
 
 from diffsim import Integration, Scene, SceneError, Simulator
-from diffsim.robot.constraint import constrained
+from diffsim.robot.constants import constrained
 from diffsim.sim import simulator
 from diffsim_cli.report import approximations
 

@@ -205,13 +205,13 @@ def test_memory_holds_command_clock_actions_and_noise() -> None:
 def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     """Of a robot whose x is the world's y: velocity and gravity are in its frame; the noise is the actor's alone."""
     task, n = task_of(name), len(TASKS[name].robot.joints)  # type: ignore[attr-defined]
-    names, sizes = zip(*task.obs_parts, strict=True)
     qpos, qvel = torch.rand(3, 7 + n, dtype=REAL), torch.rand(3, 6 + n, dtype=REAL)
     qpos[:, 3:7] = np.sqrt(0.5) * torch.tensor([1.0, 0, 0, 1])
     velocity = torch.stack((qvel[:, 1], -qvel[:, 0], qvel[:, 2]), 1)
     memory = torch.rand(3, task.num_memory, dtype=REAL)
     command, clock, last, before, noise, _ = memory.split((3, 1, n, n, 9 + 2 * n, 6), dim=-1)
-    obs = dict(zip(names, task.observe_with(qpos, qvel, last, memory).split(sizes, dim=-1), strict=True))
+    obs = task.named(task.observe_with(qpos, qvel, last, memory))
+    names, sizes = zip(*task.obs_parts, strict=True)
     down, joints = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3), qpos[:, 7:] - task._home
     sensed = dict(zip(names[:5], (velocity, qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
     rest = dict(actions=last, command=command, height=qpos[:, 2:3], action_change=last - before)
@@ -245,7 +245,7 @@ def test_nothing_is_lost_on_the_reference(name: str) -> None:
             parts[change][:, index] += by
         return task.observe_with(parts["qpos"], parts["qvel"], action, parts["memory"])
 
-    np.testing.assert_allclose(task.reward(observed(), action), task.alive, atol=1e-9)
+    np.testing.assert_allclose(task.reward(observed(), action), task.weights["alive"], atol=1e-9)
     assert not task.terminated(observed())
     assert task.terminated(observed("qpos", 2, -0.5 * task.robot.height)) and task.terminated(observed("qpos", 4, 1.5))
     assert score(torch.tensor(0.0), 1.0) == 0 and score(torch.tensor(3.0), 1.0) == np.log(4.0).astype(np.float32)
@@ -263,7 +263,7 @@ def test_each_term_of_the_reward(name: str) -> None:
     expected = {"command": (speed, speed, yaw), "true_base_lin_vel": (speed, speed, 0.5 * np.log1p(d**2 / 0.5))}
     expected |= {"true_base_ang_vel": (0.2 * np.log1p(calm), 0.2 * np.log1p(calm), yaw)}
     expected |= {"true_projected_gravity": (0.4 * tilt, 0.4 * tilt, 0.0), "height": (0.2 * np.log1p(d**2 / 0.01),)}
-    expected |= {"action_change": (task.smooth * np.log1p(d**2 / n / 0.2),) * n}
+    expected |= {"action_change": (-task.weights["action_rate"] * np.log1p(d**2 / n / 0.2),) * n}
     expected |= {"joints_from_reference": (1.2 * np.log1p(d**2 / 0.05) / n,) * n}
     expected |= {"feet_from_reference": (0.4 * np.log1p(d**2 / 0.0004) / legs,) * legs, "feet_slip": (0.15 * d / legs,)}
     if name == "g1":
@@ -271,12 +271,26 @@ def test_each_term_of_the_reward(name: str) -> None:
         expected["feet_apart"] = (0.0,)
         near = best.clone()
         near[begin["feet_apart"]] = task.robot.apart - d
-        np.testing.assert_allclose(task.alive - task.reward(near, near), np.log1p(d**2 / 0.003))
+        np.testing.assert_allclose(task.weights["alive"] - task.reward(near, near), np.log1p(d**2 / 0.003))
     for part, costs in expected.items():
         for k, cost in enumerate(costs):
             off = best.clone()
             off[begin[part] + k] += d
-            np.testing.assert_allclose(task.alive - task.reward(off, off), cost, atol=1e-12, err_msg=f"{part} {k}")
+            np.testing.assert_allclose(
+                task.weights["alive"] - task.reward(off, off), cost, atol=1e-12, err_msg=f"{part} {k}"
+            )
+
+
+def test_a_weight_of_zero_switches_a_term_off() -> None:
+    """And no other one; all of them sum up to the reward."""
+    task = task_of("g1")
+    obs = torch.rand(5, task.obs_dim, dtype=REAL, generator=torch.Generator().manual_seed(0))
+    terms, reward = task.reward_terms(obs, obs), task.reward(obs, obs)
+    assert terms.keys() == task.weights.keys() and all(term.any() for term in terms.values())
+    torch.testing.assert_close(sum(terms.values()), reward)
+    for name, term in terms.items():
+        task.weights = type(task).weights | {name: 0.0}
+        torch.testing.assert_close(task.reward(obs, obs), reward - term)
 
 
 def test_memory_goes_with_the_episode() -> None:

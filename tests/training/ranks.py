@@ -58,7 +58,7 @@ def main(directory: str, *setting: str) -> None:
         script.main([*setting, "--run-dir", str(path)])
         run, learner = runs[-1]
         modules = {name: part.state_dict() for name, part in checkpoint.parts(learner).items()}
-        state = dict(modules=modules, episodes=list(run._episodes.rollouts), control_steps=run.control_steps)
+        state = dict(modules=modules) | {k: v for k, v in run.recorder.state_dict().items() if k != "seconds"}
         torch.save(state, path.with_suffix(f".{rank}.pt"))
 
 

@@ -72,6 +72,22 @@ def test_evaluations_are_alike_whatever_was_before() -> None:
     assert env.qpos is pinned[0] and torch.equal(env.qpos, expected.qpos[0])
 
 
+def test_terms_of_the_reward_sum_up_to_the_return() -> None:
+    """Of robots that fall at different times, after which they begin anew."""
+    env = diffsim.make("go2", num_envs=4, max_episode_steps=30)
+    fixed = torch.rand(12, generator=torch.Generator().manual_seed(0))
+    offsets = torch.linspace(0.0, 3.0, 4).unsqueeze(1)
+    player = evaluation.Player(env, lambda obs: offsets * (2.0 * fixed - 1.0))
+    for _ in range(2):
+        found = player.evaluate()
+        assert len(found.lengths.unique()) > 1 and found.lengths.max() == 30
+        values = {name: value for name, value in found.scalars().items() if name.startswith("eval/reward_")}
+        assert values.keys() == {f"eval/reward_{name}" for name in set(env.task.weights) - {"feet_apart"}}
+        assert sum(values.values()) == pytest.approx(found.returns.mean().item(), rel=1e-4)
+        assert values["eval/reward_alive"] == pytest.approx(4.0 * found.length)
+        assert values["eval/reward_action_rate"] < 0 and "reward" not in str(found)
+
+
 def some(result: Evaluation, **changes: Any) -> Evaluation:
     returns, lengths = torch.tensor([4.0, 1.0, 3.0, 100.0, 2.0]), torch.tensor([5, 2, 7, 10, 1])
     qpos = torch.arange(10.0).reshape(10, 1, 1).expand(10, 5, 15)

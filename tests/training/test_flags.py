@@ -26,6 +26,7 @@ import diffsim
 import gps
 import pfpn
 import ppo_baseline
+import rpo
 import shac
 from diffsim.training import checkpoint, errors, flags, parse, ranges
 from diffsim.training.evaluation import make_env
@@ -97,6 +98,8 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
             "--env walker --accuracy fast",
             "task 'walker' has no preset 'fast' on soft contact; choose from default, accurate",
         ),
+        ("--env my/robot.xml", "my/robot.xml is a robot without a task: give a file with a class, my_task.py"),
+        ("--env cartpole --horizon 500000000", "states and actions of a horizon of 500,000,000 steps would take"),
         ("--env cartpole:rough=10", "cartpole touches no ground, so it has no terrain"),
         ("--env ant:clip.npz", "task 'ant' has no option 'clip.npz': write rough=20, randomise=none or a range like"),
         ("--env humanoid_imitation:nowhere", "no such clip: nowhere; give an .npz or .csv file"),
@@ -226,20 +229,128 @@ def test_every_number_has_a_range(script):
 # Defaults -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
-def test_defaults_are_the_tables(script):
-    for env in diffsim.TASKS:
-        args = parse(script.Args, ["--env", env, "--device", "cpu"])
-        expected = dict(zip(script.COLUMNS, script.PER_TASK[env], strict=True)) if env in script.PER_TASK else {}
-        if hasattr(script, "CPU"):
+def test_defaults_are_the_tables(script, device):
+    """The learner's row, what the device and the contact change, and then what the task sets itself."""
+    name, on_cpu = script.__name__, device == "cpu"
+    for env, task in diffsim.TASKS.items():
+        args = parse(script.Args, ["--env", env, "--device", device])
+        like = task.like or env
+        expected = dict(zip(script.COLUMNS, script.PER_TASK[like], strict=True)) if like in script.PER_TASK else {}
+        if hasattr(script, "CPU") and on_cpu:
             expected |= {name: min(expected.get(name, most), most) for name, most in script.CPU.items()}
-            expected |= getattr(script, "ON_CPU", {}).get(env, {})
-        preset = getattr(script, "INTEGRATION", {}).get(env) or diffsim.TASKS[env].integration("default")
-        if preset.contact == "mujoco" and script.__name__ in ("shac", "sapo"):  # shorter rollouts of more
-            expected |= {"num_envs": 4 * expected.get("num_envs", script.Args().num_envs)}
-            assert args.horizon == (16 if env in ("g1", "g1_track") and script.__name__ in ("shac", "sapo") else 8)
+        expected |= getattr(script, "ON_CPU" if on_cpu else "ON_GPU", {}).get(env if on_cpu else like, {})
+        preset = getattr(script, "INTEGRATION", {}).get(env) or task.integration("default")
+        if preset.contact == "mujoco" and name in ("shac", "rpo", "sapo"):  # shorter rollouts of more environments
+            expected |= {"horizon": 8} | getattr(script, "MUJOCO", {})
+            if on_cpu or name != "sapo":
+                expected["num_envs"] = 4 * expected.get("num_envs", script.Args().num_envs)
+        expected |= {**task.defaults.get(name, {}), **task.defaults.get(f"{name} {'cpu' if on_cpu else 'gpu'}", {})}
         expected |= dict(contact=preset.contact, substeps=preset.substeps, implicit=preset.implicit)
         assert {name: getattr(args, name) for name in expected} == expected
+
+
+def test_contacts_begin_softly_where_that_was_better():
+    args = parse(rpo.Args, "--env half_cheetah --contact mujoco --device cuda".split())
+    assert (args.onset, args.horizon, args.adjoint_clip, args.num_envs) == ((0.02, 0.005), 16, 3.0, 1024)
+    args = parse(rpo.Args, "--env half_cheetah --contact mujoco --onset 0 0 --horizon 8 --device cpu".split())
+    assert (args.onset, args.horizon, args.num_envs) == ((0.0, 0.0), 8, 256)
+    for words in ("--env half_cheetah", "--env ant --contact mujoco"):
+        assert parse(rpo.Args, words.split()).onset == (0.0, 0.0)
+
+
+NEAR = {"adjoint_clip": 5.0, "symmetric": True}  # its standing pose, which is symmetric
+SMALL_CRITIC, LARGE_CRITIC = ({"critic_hidden": hidden, "critic_lr": 1e-3} for hidden in ((256, 128), (512, 256)))
+
+
+@pytest.mark.parametrize(
+    ("learner", "env", "cpu", "gpu"),
+    [
+        (
+            shac,
+            "go2",
+            NEAR | SMALL_CRITIC | dict(num_envs=256, horizon=8, iterations=600, initial_log_std=-2.0, target_alpha=0.9),
+            dict(num_envs=1024, iterations=1000),
+        ),
+        (shac, "g1", NEAR | SMALL_CRITIC | dict(num_envs=256, horizon=16, iterations=1500, initial_log_std=-2.0), {}),
+        (shac, "g1_track", LARGE_CRITIC | dict(num_envs=1024, horizon=16, iterations=1500, adjoint_clip=5.0), {}),
+        (
+            rpo,
+            "go1",
+            NEAR | SMALL_CRITIC | dict(num_envs=64, horizon=16, iterations=400, critic_iterations=4, trust=0.5),
+            dict(num_envs=1024, epochs=4, initial_log_std=-2.0),
+        ),
+        (rpo, "g1", NEAR | SMALL_CRITIC | dict(num_envs=64, iterations=600, initial_log_std=-3.0), {"num_envs": 1024}),
+        (
+            rpo,
+            "g1_track:friction=0.8:1.2",
+            LARGE_CRITIC | dict(num_envs=256, horizon=16, critic_iterations=8, epochs=4, trust=0.5, iterations=400),
+            dict(num_envs=1024, initial_log_std=-3.0, adjoint_clip=5.0, symmetric=False),
+        ),
+        (
+            sapo,
+            "g1",
+            NEAR | SMALL_CRITIC | dict(num_envs=256, horizon=16, iterations=700, critic_iterations=4, population=1),
+            dict(num_envs=1024, iterations=1200, target_entropy=(-1.0, -1.0), target_alpha=0.9, initial_log_std=-2.0),
+        ),
+        (
+            sapo,
+            "g1_track",
+            SMALL_CRITIC | dict(num_envs=256, horizon=16, iterations=1300, critic_iterations=4, adjoint_clip=0.0),
+            LARGE_CRITIC | dict(num_envs=1024, iterations=700, critic_iterations=8, target_entropy=(-1.0, -2.0)),
+        ),
+        (sapo, "go2", dict(num_envs=256, horizon=8, initial_log_std=-1.0, critic_hidden=(128, 128)), {"num_envs": 64}),
+        (
+            ppo_baseline,
+            "g1_track",
+            dict(hidden=(512, 256, 128), num_envs=256, minibatch_size=2048, horizon=24, initial_log_std=-1.0),
+            dict(num_envs=4096, minibatch_size=24576, epochs=5, iterations=5000),
+        ),
+        (shac, "humanoid_imitation", dict(actor_hidden=(256, 128), target_alpha=0.995, num_envs=64, substeps=48), {}),
+    ],
+)
+def test_what_a_robot_sets_itself(learner, env, cpu, gpu):
+    """On a CPU, and what else it sets on a GPU."""
+    for device, expected in (("cpu", cpu), ("cuda:1", cpu | gpu)):
+        args = vars(parse(learner.Args, ["--env", env, "--device", device]))
+        assert {name: args[name] for name in expected} == expected
+
+
+MINE = """
+from diffsim.tasks.cartpole import CartPole
+
+class Mine(CartPole):
+    like = "ant"
+    defaults = {"shac": {"horizon": 5, "num_envs": 7, "symmetric": True}, "shac gpu": {"num_envs": 9, "gamma": 0.9}}
+
+class Misspelt(Mine):
+    defaults = {"shac": {"horizons": 5}}
+
+class Flat(Mine):
+    defaults = {"horizon": 5}
+
+class Lost(Mine):
+    like = "ants"
+"""
+
+
+def test_a_task_of_a_users_own_sets_defaults(tmp_path, capsys):
+    (tmp_path / "mine.py").write_text(MINE)
+    words = ["--env", "mine.py:Mine", "--contact", "mujoco", "--no-symmetric"]
+    cpu, gpu = (parse(shac.Args, [*words, "--device", device]) for device in ("cpu", "cuda"))
+    ant = parse(shac.Args, ["--env", "ant", "--device", "cpu"])
+    assert (cpu.horizon, cpu.num_envs, cpu.gamma, cpu.symmetric) == (5, 7, 0.99, False)
+    assert (gpu.horizon, gpu.num_envs, gpu.gamma, cpu.actor_hidden) == (5, 9, 0.9, ant.actor_hidden)
+    assert parse(shac.Args, [*words, "--horizon", "6"]).horizon == 6
+    assert parse(rpo.Args, [*words, "--device", "cpu"]).horizon == 8
+    for name, message in (
+        ("Misspelt", "task 'mine.py:Misspelt' has defaults of flags that shac.py lacks: --horizons"),
+        ("Flat", "task 'mine.py:Flat': defaults are by script, such as {'shac': {'horizon': 16}}, not 'horizon'"),
+        ("Lost", "unknown task 'ants': choose from cartpole, hopper"),
+    ):
+        line = refusal(lambda name=name: parse(shac.Args, ["--env", f"mine.py:{name}"]), capsys)
+        assert line.startswith(f"script.py: {message}")
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,22 @@ def test_statistics_are_those_of_all_data(rollouts: list[np.ndarray], size: int 
     torch.testing.assert_close(normalizer.inverse(normalizer(probe)), probe, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-13), (torch.float32, 2e-6)])
+def test_statistics_of_unlike_batches_are_exact_to_rounding(
+    rng: np.random.Generator, dtype: torch.dtype, rtol: float
+) -> None:
+    """Batches of other means, deviations and sizes, the first of a single sample."""
+    parts = ((1, 3.0, 1.0), (7, -2.0, 0.5), (300, 4.0, 3.0), (50, 10.0, 0.1))
+    batches = [rng.normal(mean, std, size=(count, 2)).astype(np.float32) for count, mean, std in parts]
+    normalizer = ObsNormalizer(2).to(dtype)
+    for k, batch in enumerate(batches):
+        normalizer.update(torch.tensor(batch, dtype=dtype))
+        data = np.concatenate(batches[: k + 1], dtype=np.float64)
+        np.testing.assert_allclose(normalizer.mean, data.mean(0), rtol=rtol)
+        np.testing.assert_allclose(normalizer.var, data.var(0), rtol=rtol)
+        np.testing.assert_allclose(normalizer.std, np.sqrt(data.var(0) + 1e-5), rtol=rtol)
+
+
 @pytest.mark.parametrize("shape", [(), (4,)])
 def test_counting_does_not_end_at_the_last_integer_of_float32(rng: np.random.Generator, shape: tuple[int, ...]) -> None:
     """From 2^24 samples of mean 2 on, one by one; half as many of mean 8 move the mean by a third of the way."""

@@ -32,7 +32,7 @@ from diffsim.env import DiffEnv
 from diffsim.tasks import REGISTERED
 from diffsim.tasks.cartpole import CartPole
 from diffsim.training import ClippedAdam, Run, checkpoint, evaluate, fail, load_policy, parse
-from diffsim.training.directory import COLUMNS
+from diffsim.training.log import COLUMNS
 
 # Iterations of a few milliseconds.
 TINY = "--env cartpole --num-envs 2 --horizon 8 --eval-episodes 1 --device cpu".split()

@@ -16,12 +16,14 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def clamp_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the force of a joint's actuators within its bounds."""
     t = types(spec)
     T, Model, pick = t.T, t.Model, blocks(spec).pick
     CLAMP = "clamp" in spec.features
 
     @wp.func
     def unclamped_force(m: Model, i: int, motor: T, q: T, qd: T):
+        """Return the actuators' force before it is clamped."""
         return motor + T(m.servo_stiffness[i]) * (T(m.servo_ref[i]) - q) - T(m.servo_damping[i]) * qd
 
     @wp.func

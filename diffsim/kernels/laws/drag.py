@@ -5,7 +5,7 @@ of the centre of mass and angular velocity w, for each component,
 
     f = -(a l + b |l| l),   torque = -(c w + d |w| w),
 
-with a and c the viscous drag of a sphere of the box's mean side, b and d the pressure on its faces (robot/drag.py).
+with a and c the viscous drag of a sphere of the box's mean side, b and d the pressure on its faces (robot/fluid.py).
 
 The law is invariant under a rotation of the link together with its motion. So like the inertial part of phi it has no
 adjoint of the pose, only one of the velocity (backward.py). Both integrators treat it explicitly.
@@ -23,6 +23,7 @@ from diffsim.kernels.thread.spec import KernelSpec
 
 @cache
 def drag_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the fluid's wrench on a link, and its adjoint."""
     t, sp = types(spec), spatial(spec)
     T, vec3, vec6, mat3, Model = t.T, t.vec3, t.vec6, t.mat3, t.Model
     join, force_at, point_velocity = sp.join, sp.force_at, sp.point_velocity

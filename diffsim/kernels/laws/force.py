@@ -23,6 +23,7 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def external_force(spec: KernelSpec) -> SimpleNamespace:
+    """Make the wrenches on bodies, and their adjoint."""
     t, sp = types(spec), spatial(spec)
     T, vec3, Model, Lane, block = t.T, t.vec3, t.Model, t.Lane, blocks(spec)
     Links, Nodes, Adjoints = t.Links, t.Nodes, t.Adjoints
@@ -73,6 +74,7 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def write_forces_adjoint(m: Model, here: Lane, drop: T, adj_forces: t.vec6s, g_forces: t.array2):
+        """Write the gradients of the forces, and 0 where the gradient is dropped."""
         for entry in range(m.body_begin[here.at], m.body_begin[here.at + SLOTS]):
             body = m.body[entry]
             for k in range(6):

@@ -23,6 +23,7 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def joint_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the force of a joint, and its derivatives."""
     t = types(spec)
     T, Model, Lane = t.T, t.Model, t.Lane
     vec2, block = t.vec2, blocks(spec)
@@ -71,6 +72,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def limit_constants(m: Model, here: Lane, i: int):
+        """Return the limit's k_limit and d_limit."""
         k = T(m.k_limit[i])
         d = T(m.d_limit[i])
         if wp.static(VARIED):
@@ -90,6 +92,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def passive_force(m: Model, here: Lane, i: int, q: T, qd: T):
+        """Return the force of spring, damper and limit."""
         force = T(0.0)
         if wp.static(STIFFNESS):
             force = force - T(m.stiffness[i]) * (q - T(m.spring_ref[i]))
@@ -135,13 +138,5 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
             k, d = limit_constants(m, here, i)
             kq = kq + limit_active(k, d, violation, qd) * d * return_velocity(violation, end_qd)
         return vec2(kq, -resisted[1])
-
-    @wp.func
-    def limit_constants_derivatives(m: Model, here: Lane, i: int, q: T, qd: T, end_qd: T):
-        """Return d force / d factor of (k_limit, d_limit); arguments as in derivatives."""
-        violation = limit_violation(m, i, q)
-        k, d = limit_constants(m, here, i)
-        active = limit_active(k, d, violation, qd)
-        return active * vec2(T(m.k_limit[i]) * violation, -T(m.d_limit[i]) * wp.abs(violation) * end_qd)
 
     return functions(locals())

@@ -28,6 +28,7 @@ SHORTEST = 1e-6  # m
 
 @cache
 def muscle_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the muscles' wrenches, and their adjoint."""
     t, sp = types(spec), spatial(spec)
     T, vec3, vec6, Model, Lane, array = t.T, t.vec3, t.vec6, t.Model, t.Lane, t.Ts
     Links, Nodes, Adjoints, join, point_velocity = t.Links, t.Nodes, t.Adjoints, sp.join, sp.point_velocity

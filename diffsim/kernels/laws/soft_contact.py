@@ -19,7 +19,6 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.laws.terrain import terrain_contact
-from diffsim.kernels.thread.lane import K_D, K_N, K_T, MU
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -28,12 +27,13 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make the law of soft contact, and its adjoint."""
     t, sp, block = types(spec), spatial(spec), blocks(spec)
     T, vec3, vec4, Model, Lane, Link = t.T, t.vec3, t.vec4, t.Model, t.Lane, t.Link
-    Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
+    Node, Adjoint = t.Node, t.Adjoint
     CarrierPos, force_at, point_velocity, pick = t.CarrierPos, sp.force_at, sp.point_velocity, block.pick
     ground, TERRAIN = terrain_contact(spec), "terrain" in spec.features
-    IMPLICIT, VARIED, in_frame, in_world = spec.implicit, spec.varied, ground.in_frame, ground.in_world
+    IMPLICIT, in_frame, in_world = spec.implicit, ground.in_frame, ground.in_world
 
     @wp.func
     def sphere_state(m: Model, here: Lane, c: int, link: Link, carrier: CarrierPos):
@@ -95,18 +95,6 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(gx, gy, g_n * here.k_d * d, g_d)
 
     @wp.func
-    def contact_constants_adjoint(here: Lane, d: T, v: vec3, a: vec3, g: vec3, h: T):
-        """Return the adjoints of (k_n, k_d, k_t, mu); arguments as in contact_adjoint."""
-        f_n = (here.k_d * v[2] - here.k_n) * d
-        c, sliding = friction_viscosity(here, f_n, v)
-        g_c = -(g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
-        speed = pick(T(0.0), sliding, wp.sqrt(v[0] * v[0] + v[1] * v[1]), T(1.0))
-        g_n = g[2] + sliding * g_c * here.mu / speed
-        g_mu = sliding * g_c * f_n / speed
-        g_c = (T(1.0) - sliding) * g_c
-        return vec4(-g_n * d, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
-
-    @wp.func
     def add_contacts(m: Model, here: Lane, k: int, link: Link, carrier: CarrierPos, load: t.Load):
         """Add link k's contacts to its load."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
@@ -141,9 +129,8 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         link: Link,
         node: Node,
         carrier: CarrierPos,
-        # adjoints in and out
+        # adjoint in and out
         adj: Adjoint,
-        adj_factors: Array,
     ):
         """Add the contacts' part of phi to link k's adjoints."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
@@ -162,12 +149,6 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                     B = active * contact_resistance(here, depth, fc[3])
                     f = f - wp.cw_mul(B, a)
                 g = contact_adjoint(here, depth, v, a, g_f, hi)
-                if wp.static(VARIED):
-                    gk = contact_constants_adjoint(here, depth, v, a, g_f, hi)
-                    adj_factors[K_N] = adj_factors[K_N] + T(m.k_n) * gk[0]
-                    adj_factors[K_D] = adj_factors[K_D] + T(m.k_d) * gk[1]
-                    adj_factors[K_T] = adj_factors[K_T] + T(m.k_t) * gk[2]
-                    adj_factors[MU] = adj_factors[MU] + T(m.mu) * gk[3]
                 g_v = vec3(g[0], g[1], g[2])
                 if wp.static(TERRAIN):
                     g_turn = wp.cross(g_v, v)[1] - wp.cross(g_f, f)[1]  # adjoint of the angle of E

@@ -12,7 +12,7 @@ by both. So d and n are continuous, d's gradient is n, and dn = k t (t . dc) wit
 two features are equally near: for a centre that is itself below a ridge, which is a depth of r or more, and in a notch
 that the sphere does not fit into.
 
-The law of contact, be it contact.py's or constraint.py's, acts in the frame E = (t, y, n) of the feature. Its adjoint
+The law of contact, be it soft_contact.py's or MuJoCo's, acts in the frame E = (t, y, n) of the feature. Its adjoint
 includes the rotation of that frame.
 """
 
@@ -28,6 +28,7 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
+    """Make the ground's distance from a sphere, and the frame of what the sphere touches."""
     t, block, BLOCK, TERRAIN = types(spec), blocks(spec), spec.block, "terrain" in spec.features
     FRAMED = spec.framed
     T, U, vec3, vec4, mat3, Model, uvec4 = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.scene.vec4

@@ -1,4 +1,4 @@
-"""MuJoCo's friction cones: the force of a contact as a function of jar (constraint.py), its normal along z.
+"""MuJoCo's friction cones: the force of a contact as a function of jar (impedance.py), its normal along z.
 
 elliptic     the quadratic zone, where the ground holds the point, the cone's zone, where it slides, and no force
 pyramidal    four edges n +- friction t, each a one-sided row of its own: force -D_e jar . e where jar . e < 0, with
@@ -23,8 +23,14 @@ LEAST_FRICTION = 1e-5  # MuJoCo's, of a contact with friction
 UPRIGHT = 1e-9  # horizontal part of a capsule's unit vector, below which its contacts have the ground's frame
 
 
+def friction_cone(spec: KernelSpec) -> SimpleNamespace:
+    """Make the functions of the file's cone."""
+    return pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
+
+
 @cache
 def elliptic_cone(spec: KernelSpec) -> SimpleNamespace:
+    """Make the force of a contact in an elliptic cone."""
     t, pick = types(spec), blocks(spec).pick
     T, vec3, mat3 = t.T, t.vec3, t.mat3
 
@@ -73,6 +79,7 @@ def elliptic_cone(spec: KernelSpec) -> SimpleNamespace:
 
 @cache
 def pyramidal_cone(spec: KernelSpec) -> SimpleNamespace:
+    """Make the same of a pyramidal cone, and its heading."""
     t, pick, in_frame = types(spec), blocks(spec).pick, terrain_contact(spec).in_frame
     T, U, vec3, vec4, mat3 = t.T, t.U, t.vec3, t.vec4, t.mat3
 

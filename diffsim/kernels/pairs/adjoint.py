@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.mujoco.constraint import pair_column
+from diffsim.kernels.mujoco.ground import pair_column
 from diffsim.kernels.pairs.equality_adjoint import equality_adjoint
 from diffsim.kernels.pairs.geoms import pair_geoms
 from diffsim.kernels.pairs.jacobian import pair_jacobian
@@ -18,7 +18,6 @@ from diffsim.kernels.pairs.listing import pair_list
 from diffsim.kernels.pairs.rows import pair_rows
 from diffsim.kernels.pairs.solver import row_solver
 from diffsim.kernels.pairs.touch_adjoint import touch_adjoint
-from diffsim.kernels.thread.lane import K_D, K_N, MU
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -40,9 +39,9 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Nodes Adjoints Ts".split()
     )
     cone = pyramidal_cone(spec) if "pyramid" in spec.features else elliptic_cone(spec)
-    SOLVES, VARIED, LEARNED = spec.solves, spec.varied, spec.parameters > 0
+    SOLVES, LEARNED = spec.solves, spec.parameters > 0
     COLUMN = pair_column(spec)  # of jar in the checkpoint
-    COLUMNS = spec.parameters - 2 * spec.pairs  # see parameters.py
+    COLUMNS = spec.columns.pairs
     TOUCH = "geoms_rows" in spec.features
     geoms, touch = (pair_geoms(spec, True), touch_adjoint(spec)) if TOUCH else (None, None)
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]
@@ -92,30 +91,18 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
         return wp.cross(g, wp.spatial_top(motion)) - wp.cross(f, wp.spatial_top(nodes[i].W))
 
     @wp.func
-    def add_constants_adjoint(
-        m: Model, here: Lane, c: int, rate: vec3, links: Links, contacts: Contacts, adj_factors: Array
-    ):
-        """Add the derivatives by factors or parameters of a block's part, -f . rate."""
+    def add_constants_adjoint(m: Model, here: Lane, c: int, rate: vec3, contacts: Contacts, adj_parameters: Array):
+        """Add the derivatives by parameters of a block's part, -f . rate."""
         s = contacts[c].row
         f_rate = wp.dot(contacts[c].f, rate)
-        if wp.static(LEARNED):
-            adj_factors[COLUMNS + 2 * s + 1] = adj_factors[COLUMNS + 2 * s + 1] + f_rate
-        if wp.static(TOUCH and (VARIED or LEARNED)):
+        adj_parameters[COLUMNS + 2 * s + 1] = adj_parameters[COLUMNS + 2 * s + 1] + f_rate
+        if wp.static(TOUCH):
             if m.row_kind[s] == GEOMS:
                 coef = rows.constants(m, here, s)
                 jar = contacts[c].jar
                 state = rows.geoms_state(m, here, c, contacts)
                 by_mu = cone.friction_derivative(state[0], coef[2], T(m.row_params[s][3]), jar, rate)
-                if wp.static(LEARNED):
-                    adj_factors[COLUMNS + 2 * s] = adj_factors[COLUMNS + 2 * s] - by_mu
-                if wp.static(VARIED):
-                    g = contacts[c].H * rate
-                    i, j = J.ends(m, s)
-                    velocity = J.rates(m, c, contacts, links[i].V, links[j].V, links[i].qd, links[j].qd)
-                    by_k = T(0.5) * coef[1] * wp.dot(g, velocity) + g[2] * state[2]
-                    adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
-                    adj_factors[K_D] = adj_factors[K_D] - f_rate / here.k_d
-                    adj_factors[MU] = adj_factors[MU] - T(m.row_params[s][2]) * by_mu
+                adj_parameters[COLUMNS + 2 * s] = adj_parameters[COLUMNS + 2 * s] - by_mu
 
     @wp.func
     def geoms_adjoint(
@@ -141,13 +128,13 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_adjoint(
-        m: Model, here: Lane, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints, adj_factors: Array
+        m: Model, here: Lane, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints, adj_parameters: Array
     ):
         """Add the rows' part of phi, -f . rate under lambda, to the adjoints of links, joints and constants."""
         for c in range(here.begin, here.end):
             rate = lambda_rates(m, c, contacts, nodes)
-            if wp.static(VARIED or LEARNED):
-                add_constants_adjoint(m, here, c, rate, links, contacts, adj_factors)
+            if wp.static(LEARNED):
+                add_constants_adjoint(m, here, c, rate, contacts, adj_parameters)
             if m.row_kind[contacts[c].row] == GEOMS:
                 if wp.static(TOUCH):
                     geoms_adjoint(m, here, c, rate, links, contacts, nodes, adj)

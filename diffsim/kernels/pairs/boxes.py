@@ -34,68 +34,11 @@ APART, EDGES = -1, 6  # no axis, and the first of the axes of edges; those of fa
 
 
 @cache
-def box_contacts(U: type) -> SimpleNamespace:
-    """Make the functions for numbers of this type."""
-    t, spheres = geom_types(U), sphere_contacts(U)
-    vec2, vec3, vec4, mat3, Geom, Touch, Touches = t.vec2, t.vec3, t.vec4, t.mat3, t.Geom, t.Touch, t.Touches
-    column, nearest = spheres.column, spheres.nearest
-    single = int(U == wp.float32)
-    axis_sq, slack, same_sq, skew, rounding = (each[single] for each in (AXIS_SQ, SLACK, SAME_SQ, SKEW, ROUNDING))
-
-    @wp.func
-    def extent(size: vec3, n: vec3):
-        """Return how far a box reaches from its centre along n, an axis in its frame."""
-        return wp.dot(size, wp.abs(n))
-
-    @wp.func
-    def separating_axis(one: Geom, other: Geom, margin: U):
-        """Find the axis along which two boxes overlap least.
-
-        Returns:
-            its number: i or 3 + i of a face normal to axis i of the first box or of the second, 6 + 3 i + j of edges
-            along axis i of the first and j of the second, APART if the boxes are farther from each other than the
-            margin; and the axis of edges in the world, towards the second box.
-        """
-        Q = wp.transpose(one.R) * other.R
-        d = wp.transpose(one.R) * (other.x - one.x)
-        d2 = wp.transpose(other.R) * (other.x - one.x)
-        reach = margin + U(slack) * wp.dot(one.size + other.size, vec3(U(1.0), U(1.0), U(1.0)))
-        number = int(APART)
-        best = U(-1e30)
-        for k in range(6):
-            i = k % 3
-            gap = wp.abs(d[i]) - one.size[i] - extent(other.size, Q[i])
-            if k > 2:
-                gap = wp.abs(d2[i]) - other.size[i] - extent(one.size, column(Q, i))
-            if gap > reach:
-                return APART, d
-            if gap > best:
-                best = gap
-                number = k
-        face = best
-        face_number = number
-        axis = vec3()
-        edges, bias = int(EDGES), U(EDGE_BIAS)  # here, as Warp reads a named constant only where it first appears
-        for k in range(9):
-            e = vec3()
-            e[k // 3] = U(1.0)
-            n = wp.cross(e, column(Q, k % 3))
-            square = wp.dot(n, n)
-            if square > U(axis_sq):
-                n = n / wp.sqrt(square)
-                gap = wp.abs(wp.dot(n, d)) - extent(one.size, n) - extent(other.size, wp.transpose(Q) * n)
-                if gap > reach:
-                    return APART, d
-                if gap > face and gap - bias * wp.abs(gap) > best:
-                    best = gap
-                    number = edges + k
-                    axis = n
-        cosine = axis[face_number % 3]
-        if face_number > 2:
-            cosine = wp.dot(axis, column(Q, face_number - 3))
-        if wp.abs(cosine) > U(ALIAS) and best < face + U(ALIAS_BIAS) * wp.abs(face) + U(TINY):
-            number = face_number
-        return number, wp.sign(wp.dot(axis, d)) * (one.R * axis)
+def face_clipping(U: type) -> SimpleNamespace:
+    """Make the functions that clip one face to another for numbers of this type."""
+    t, single = geom_types(U), int(U == wp.float32)
+    vec2, vec3, vec4, Touches = t.vec2, t.vec3, t.vec4, t.Touches
+    same_sq, skew, rounding = (each[single] for each in (SAME_SQ, SKEW, ROUNDING))
 
     @wp.func
     def append(count: int, z: vec3, a: vec3, b: vec3, kept: U, same: U, found: Touches):
@@ -127,7 +70,8 @@ def box_contacts(U: type) -> SimpleNamespace:
             p = corner(centre, du, dv, k)
             q = corner(centre, du, dv, k + 1)
             D = q - p
-            m_p, m_q = vec3(), vec3()
+            m_p = vec3()
+            m_q = vec3()
             outside = int(0)
             for side in range(4):
                 i = side // 2
@@ -162,10 +106,83 @@ def box_contacts(U: type) -> SimpleNamespace:
                 count = append(count, centre + alpha * du + beta * dv, w, up, U(0.0), same, found)
         return count
 
+    return functions(locals())
+
+
+@cache
+def box_contacts(U: type) -> SimpleNamespace:
+    """Make the functions for numbers of this type."""
+    t, spheres = geom_types(U), sphere_contacts(U)
+    vec2, vec3, vec4, mat3, Geom, Touch, Touches = t.vec2, t.vec3, t.vec4, t.mat3, t.Geom, t.Touch, t.Touches
+    column, nearest, clip = spheres.column, spheres.nearest, face_clipping(U).clip
+    axis_sq, slack = (each[int(U == wp.float32)] for each in (AXIS_SQ, SLACK))
+
+    @wp.func
+    def extent(size: vec3, n: vec3):
+        """Return how far a box reaches from its centre along n, an axis in its frame."""
+        return wp.dot(size, wp.abs(n))
+
+    @wp.func
+    def separating_axis(one: Geom, other: Geom, margin: U):
+        """Find the axis along which two boxes overlap least.
+
+        Returns:
+            its number: i or 3 + i of a face normal to axis i of the first box or of the second, 6 + 3 i + j of edges
+            along axis i of the first and j of the second, APART if the boxes are farther from each other than the
+            margin; and the axis of edges in the world, towards the second box.
+        """
+        Q = wp.transpose(one.R) * other.R
+        d = wp.transpose(one.R) * (other.x - one.x)
+        d2 = wp.transpose(other.R) * (other.x - one.x)
+        ones = vec3(U(1.0), U(1.0), U(1.0))
+        reach = margin + U(slack) * (wp.dot(one.size, ones) + wp.dot(other.size, ones))
+        number = int(APART)
+        best = U(-1e30)
+        for k in range(6):
+            i = k % 3
+            gap = wp.abs(d[i]) - one.size[i] - extent(other.size, Q[i])
+            if k > 2:
+                gap = wp.abs(d2[i]) - other.size[i] - extent(one.size, column(Q, i))
+            if gap > reach:
+                return APART, d
+            if gap > best:
+                best = gap
+                number = k
+        face = best
+        face_number = number
+        axis = vec3()
+        edges, bias = int(EDGES), U(EDGE_BIAS)  # here, as Warp reads a named constant only where it first appears
+        for k in range(9):
+            e = vec3()
+            e[k // 3] = U(1.0)
+            n = wp.cross(e, column(Q, k % 3))
+            square = wp.dot(n, n)
+            if square > U(axis_sq):
+                n = n / wp.sqrt(square)
+                gap = wp.abs(wp.dot(n, d)) - extent(one.size, n) - extent(other.size, wp.transpose(Q) * n)
+                if gap > reach:
+                    return APART, d
+                if gap > face and gap - bias * wp.abs(gap) > best:
+                    best = gap
+                    number = edges + k
+                    axis = n
+        normal = vec3()
+        if face_number < 3:
+            normal[face_number] = U(1.0)
+        else:
+            normal = column(Q, face_number - 3)
+        if wp.abs(wp.dot(axis, normal)) > U(ALIAS) and best < face + U(ALIAS_BIAS) * wp.abs(face) + U(TINY):
+            number = face_number
+        return number, wp.sign(wp.dot(axis, d)) * (one.R * axis)
+
     @wp.func
     def face_contacts(ref: Geom, inc: Geom, axis: int, side: U, found: Touches):
-        """Find the corners of the box inc on a face of ref, the first box if side is 1, else -1; returns their number."""
-        x, y = (axis + 1) % 3, (axis + 2) % 3
+        """Find the corners of the box inc on the face of the box ref with this axis; returns their number.
+
+        The normal is the face's own, outward, or minus that: side is 1 if ref is the first box, else -1.
+        """
+        x = (axis + 1) % 3
+        y = (axis + 2) % 3
         N = column(ref.R, axis)
         N = wp.sign(wp.dot(N, inc.x - ref.x)) * N
         back = wp.matrix_from_cols(column(ref.R, x), column(ref.R, y), N)
@@ -173,7 +190,8 @@ def box_contacts(U: type) -> SimpleNamespace:
         R = wp.transpose(back) * inc.R
         facing = R[2]
         g = int(wp.argmax(wp.abs(facing)))
-        u, v = (g + 1) % 3, (g + 2) % 3
+        u = (g + 1) % 3
+        v = (g + 2) % 3
         centre = wp.transpose(back) * (inc.x - ref.x) - wp.sign(facing[g]) * inc.size[g] * column(R, g)
         centre[2] = centre[2] - ref.size[axis]
         du = inc.size[u] * column(R, u)

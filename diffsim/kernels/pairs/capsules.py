@@ -23,10 +23,9 @@ WHOLE, SIDE = 1, 2  # a way along an axis of the box is at most as long as the b
 
 
 @cache
-def capsule_contacts(U: type) -> SimpleNamespace:
-    """Make the functions for numbers of this type."""
-    t, spheres = geom_types(U), sphere_contacts(U)
-    vec3, Geom, Touches = t.vec3, t.Geom, t.Touches
+def box_features(U: type) -> SimpleNamespace:
+    """Make the function that finds what of a box is nearest to a capsule, and its result, for numbers of this type."""
+    vec3 = geom_types(U).vec3
     same_sq, skew_sq = (each[int(U == wp.float32)] for each in (SAME_SQ, SKEW_SQ))
     Feature = struct(
         "Feature",
@@ -38,8 +37,6 @@ def capsule_contacts(U: type) -> SimpleNamespace:
             "corner": vec3,  # whose signs are those of the nearest corner
         },
     )
-    # A point s on the capsule's axis, and how it moves
-    Place = struct("Place", {"s": U, "by_y": vec3, "by_h": vec3})
 
     @wp.func
     def nearest_feature(y: vec3, h: vec3, b: vec3):
@@ -110,6 +107,17 @@ def capsule_contacts(U: type) -> SimpleNamespace:
                         feature.corner[j] = side
         return feature
 
+    return SimpleNamespace(Feature=Feature, nearest=nearest_feature)
+
+
+@cache
+def capsule_contacts(U: type) -> SimpleNamespace:
+    """Make the functions for numbers of this type."""
+    t, spheres, features = geom_types(U), sphere_contacts(U), box_features(U)
+    vec3, Geom, Touches, Feature, nearest_feature = t.vec3, t.Geom, t.Touches, features.Feature, features.nearest
+    # A point s on the capsule's axis, and how it moves
+    Place = struct("Place", {"s": U, "by_y": vec3, "by_h": vec3})
+
     @wp.func
     def first_place(feature: Feature, y: vec3, h: vec3):
         """Return the point of a capsule's axis that is nearest to the box."""
@@ -128,9 +136,10 @@ def capsule_contacts(U: type) -> SimpleNamespace:
 
     @wp.func
     def way_over_box(feature: Feature, h: vec3):
-        """Choose the way from the first contact to the other one: 1, -1 or 0, and for each axis of the box what ends it.
+        """Choose the way along a capsule's axis from the point nearest to a box to the other contact.
 
-        That is WHOLE, SIDE, or 0 for nothing.
+        Returns:
+            its direction, 1 or -1, or 0 if there is none; and for each axis of the box what ends it: WHOLE, SIDE or 0.
         """
         whole, side = int(WHOLE), int(SIDE)  # here, as Warp reads a named constant only where it first appears
         way = U(0.0)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.mujoco.constraint import UNSOLVED
+from diffsim.kernels.mujoco.ground import UNSOLVED
 from diffsim.kernels.pairs.equality import equality_rows
 from diffsim.kernels.pairs.geoms import pair_geoms
 from diffsim.kernels.thread.model import functions, types

@@ -15,7 +15,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.mujoco.constraint import constraint_law, pair_column
+from diffsim.kernels.mujoco.ground import pair_column
+from diffsim.kernels.mujoco.impedance import impedance_law
 from diffsim.kernels.pairs.equality import equality_rows
 from diffsim.kernels.pairs.jacobian import pair_jacobian
 from diffsim.kernels.pairs.listing import pair_list
@@ -34,7 +35,7 @@ ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterat
 def pair_rows(spec: KernelSpec) -> SimpleNamespace:
     """Make the rows' part of Newton's method."""
     t, block, kin, J, equality = types(spec), blocks(spec), kinematics(spec), pair_jacobian(spec), equality_rows(spec)
-    solver, sp, constraint = row_solver(spec, "Motions"), spatial(spec), constraint_law(spec)
+    solver, sp, constraint = row_solver(spec, "Motions"), spatial(spec), impedance_law(spec)
     T, vec3, vec4, vec6, pick, join = t.T, t.vec3, t.vec4, t.vec6, block.pick, sp.join
     Model, Lane, Ck, Links, Contacts, Motions, Loads, Root, Newton = (
         getattr(t, name) for name in "Model Lane Checkpoint Links Contacts Motions Loads Root Newton".split()
@@ -171,9 +172,9 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def trial(m: Model, here: Lane, motions: Motions, alpha: T, contacts: Contacts):
-        """Evaluate the rows after the trial step alpha s; returns their part of newton.evaluate_trial."""
-        total = vec6()
-        total[3] = contacts[here.begin + LAST].D  # no solution where a contact has no room
+        """Evaluate the rows after the trial step alpha s; returns their Trial."""
+        total = t.Trial()
+        total.error_sq = contacts[here.begin + LAST].D  # no solution where a contact has no room
         for c in range(here.begin, here.end):
             s = contacts[c].row
             i, j = J.ends(m, s)
@@ -183,14 +184,11 @@ def pair_rows(spec: KernelSpec) -> SimpleNamespace:
             force_error = contacts[c].f - alpha * contacts[c].Hs - f
             w = T(m.row_params[s][4])
             accel_error = constraint.acceleration_for(force_error, w, H)
-            total = total + vec6(
-                wp.dot(step_jar, force_error),
-                wp.dot(step_jar, contacts[c].Hs),
-                wp.dot(step_jar, H * step_jar),
-                wp.dot(accel_error, accel_error),
-                w * wp.trace(H),
-                T(0.0),
-            )
+            total.slope = total.slope + wp.dot(step_jar, force_error)
+            total.linear = total.linear + wp.dot(step_jar, contacts[c].Hs)
+            total.curvature = total.curvature + wp.dot(step_jar, H * step_jar)
+            total.error_sq = total.error_sq + wp.dot(accel_error, accel_error)
+            total.stiffness = total.stiffness + w * wp.trace(H)
             contacts[c].trial_jar = jar
             contacts[c].trial_force = f
             contacts[c].H = H

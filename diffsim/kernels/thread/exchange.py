@@ -1,4 +1,4 @@
-"""Sum over the lanes that share an environment (lanes.py); all of them must call these functions together.
+"""Sum over the lanes that share an environment (division.py); all of them must call these functions together.
 
 A butterfly adds the same numbers in the same tree on every lane. So values that lanes have in common stay equal bit for
 bit.
@@ -15,6 +15,7 @@ from diffsim.kernels.thread.spec import KernelSpec
 
 @cache
 def lane_sums(spec: KernelSpec) -> SimpleNamespace:
+    """Make the sums over an environment's lanes."""
     t, threads = types(spec), spec.threads_per_env
     T, vec6, mat3 = t.T, t.vec6, t.mat3
     neighbour = f"""

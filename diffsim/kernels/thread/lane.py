@@ -17,6 +17,7 @@ K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))
 
 @cache
 def lane_of(spec: KernelSpec) -> wp.Function:
+    """Make the function that finds what a thread computes."""
     t = types(spec)
     T, Model, Lane, read = t.T, t.Model, t.Lane, blocks(spec).read
     CONTACT, VARIED, CONSTRAINED = "contact" in spec.features or spec.pairs > 0, spec.varied, spec.constrained

@@ -11,7 +11,7 @@ import warp as wp
 from diffsim.kernels.thread.division import Division
 from diffsim.kernels.thread.records import OPTIONAL_FIELDS, add_constraints, parts_of
 from diffsim.kernels.thread.spec import KernelSpec
-from diffsim.robot.drag import drag
+from diffsim.robot.fluid import drag
 from diffsim.robot.scene import Scene
 
 
@@ -176,7 +176,7 @@ FIELDS: dict[str, Field] = {
     "contact_begin": ("ints", lambda n: n.spheres[0]),  # of each entry, in the spheres
     "contact_position": ("vec3s", lambda n: n.scene.contact_position[n.spheres[1]]),  # m, centre in the link's frame
     "contact_radius": ("reals", lambda n: n.scene.contact_radius[n.spheres[1]]),  # m
-    # MuJoCo's constraints: rows of robot.constraint.Constraints
+    # MuJoCo's constraints: rows of robot.constants.Constraints
     "contact_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.contact[n.spheres[1]]),
     "contact_axis": ("vec3s", lambda n: n.scene.constraints and n.scene.constraints.axis[n.spheres[1]]),
     "limit_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.limit[n.link]),
@@ -199,7 +199,7 @@ FIELDS: dict[str, Field] = {
     ),
     "base_damping": ("real", lambda n: n.scene.base_damping[0]),  # of a floating base
     **_scenes("vec3", "gravity"),  # m/s^2
-    **_scenes("real", "k_n k_d k_t mu"),  # soft contact, see contact.py
+    **_scenes("real", "k_n k_d k_t mu"),  # soft contact, see soft_contact.py
 }
 
 

@@ -15,7 +15,7 @@ PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
         ("kind", "ints"),  # of each block
         ("touch", "ints"),  # kind of two geoms
         ("partner", "ints"),  # the block that shares its violation, or itself
-        ("params", "vec11s"),  # as rows of robot.constraint.Constraints
+        ("params", "vec11s"),  # as rows of robot.constants.Constraints
         ("polycoef", "vec5s"),  # of a joint
         ("torquescale", "reals"),  # of a turn
         ("reach_sq", "reals"),  # m^2, square of the distance of two geoms' centres within which they may touch
@@ -79,6 +79,14 @@ def add_constraints(
             "accel_sq": T,  # 1 plus the square of the acceleration
             "passes": int,  # so far
         },
+        # Constraints after a trial step alpha s, whose forces f are linearised to f - H s: sums over their rows
+        "Trial": {
+            "slope": T,  # s . (f - alpha H s - f(alpha s)), the part of the cost's slope that is not linear
+            "linear": T,  # s . H s
+            "curvature": T,  # s . H(alpha s) s
+            "error_sq": T,  # square of that difference of forces as an acceleration
+            "stiffness": T,  # ratio of contact stiffness to inertia
+        },
         # A contact with MuJoCo's law
         "Contact": {
             "p": vec3,  # the contact point, about the carrier
@@ -105,7 +113,7 @@ def add_constraints(
         structs["Contact"] |= {"E": mat3}  # the frame of jar, forces and H
     if spec.constrained:
         structs["Node"] |= {
-            "B": vec6,  # sum of S qacc, the twist that gives J a (constraint.py)
+            "B": vec6,  # sum of S qacc, the twist that gives J a (mujoco/impedance.py)
             "qacc": T,  # the joint's acceleration before damping
         }
         structs["Adjoint"] |= {"b": vec6}  # B
@@ -113,7 +121,7 @@ def add_constraints(
             "accel_link": vec6,  # acceleration of the link, of Newton's iterate
             "contacts_begin": int,  # of the link's contacts in their list
             "contacts_end": int,
-            "limit": vec3,  # the limit's row, see constraint.limit_state
+            "limit": vec3,  # the limit's row, see limits.limit_state
             "accel_joint": T,  # acceleration of the joint, of Newton's iterate
             "free_force": T,  # force of the joint without constraints
             "con_force": T,  # force of its constraints

@@ -15,6 +15,7 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def spatial(spec: KernelSpec) -> SimpleNamespace:
+    """Make the operations on spatial vectors, quaternions and rotation vectors."""
     t, pick = types(spec), blocks(spec).pick
     T, vec3, vec6, mat3, quat, uvec3 = t.T, t.vec3, t.vec6, t.mat3, t.quat, t.scene.vec3
 

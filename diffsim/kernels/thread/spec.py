@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+from diffsim.kernels.thread.columns import Columns
 from diffsim.kernels.thread.division import Division
 from diffsim.robot.pairs import PairSizes
 from diffsim.robot.scene import Scene
@@ -28,15 +29,15 @@ class KernelSpec:
     parameters: int = 0  # number of the scene's constants with gradients (parameters.py)
     forced: int  # number of bodies that external forces act on (force.py), 0 without
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, block, component]
-    # how threads share an environment (lanes.py); slots: the most links that one of them has
+    # how threads share an environment (division.py); slots: the most links that one of them has
     threads_per_env: int
     sharers: int
     trunk: int
     slots: int
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
-    constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
+    constrained: bool = False  # MuJoCo's constraints (mujoco/) in place of the laws of springs and dampers
     spheres: int = 0  # with constraints, the most contact spheres of a lane
-    pairs: int = 0  # number of blocks of rows between two bodies (kernels/pairs), and
+    pairs: int = 0  # number of blocks of rows between two bodies (pairs/), and
     pair_sizes: PairSizes = PairSizes()
 
     def has(self, names: str) -> list[bool]:
@@ -85,6 +86,11 @@ class KernelSpec:
         """Tell whether damping follows the constraints."""
         *dampers, explicit = self.has("damping base_damping tendon_damping explicit_damping")
         return self.constrained and any(dampers) and not explicit
+
+    @property
+    def columns(self) -> Columns:
+        """Return where the gradients by the scene's constants are, if it has parameters."""
+        return Columns.of(self.nlink, self.nu, self.spheres, self.pairs)
 
     @property
     def nfactor(self) -> int:

@@ -20,6 +20,7 @@ def branch_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
 
     @wp.func
     def clear(branches: Branches):
+        """Set the right-hand sides to zero."""
         room = int(ROOM)
         for i in range(room):
             branches[i].twist = vec6()

@@ -13,6 +13,7 @@ from diffsim.kernels.thread.wide import blocks
 
 @cache
 def kinematics(spec: KernelSpec) -> SimpleNamespace:
+    """Make the links' kinematics, and the access to numbers of checkpoints and states."""
     t = types(spec)
     T, vec2, vec3, mat3, quat, Model, Lane = t.T, t.vec2, t.vec3, t.mat3, t.quat, t.Model, t.Lane
     sp, read = spatial(spec), blocks(spec).read

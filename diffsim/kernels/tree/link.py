@@ -7,7 +7,6 @@ import warp as wp
 
 from diffsim.kernels.laws.drag import drag_law
 from diffsim.kernels.laws.soft_contact import contact_law
-from diffsim.kernels.thread.lane import MASS
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -15,13 +14,16 @@ from diffsim.kernels.thread.spec import KernelSpec
 
 @cache
 def link_law(spec: KernelSpec) -> SimpleNamespace:
+    """Make a link's part of the equations of motion, and its adjoint."""
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, mat3, Model, Lane, Link = t.T, t.vec3, t.mat3, t.Model, t.Lane, t.Link
-    Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
+    Node, Adjoint = t.Node, t.Adjoint
     momentum, CarrierPos, Load, VARIED = sp.momentum, t.CarrierPos, t.Load, spec.varied
-    # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
+    # With MuJoCo's constraints contacts are added in each pass of the solve: mujoco/ground.py.
     GRAVCOMP, DRAG, CONTACT = spec.has("gravcomp drag contact")
     CONTACT = CONTACT and not spec.constrained
+    NBALL, INERT = spec.nball, spec.inert
+    FIRST = 0 if spec.floating else 1 + INERT  # the first link with inertia
 
     @wp.func
     def world_inertia(m: Model, k: int, link: Link):
@@ -61,11 +63,21 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         return load
 
     @wp.func
-    def link_adjoint(m: Model, here: Lane, k: int, link: Link, node: Node, carrier: CarrierPos, adj_factors: Array):
-        """Compute the adjoints of link k's part of phi, about the carrier's position.
+    def outward(m: Model, here: Lane, carrier: t.CarrierPos, links: t.Links, motions: t.Motions, loads: t.Loads):
+        """Compute the links' velocity products, inertias and bias forces from their kinematics."""
+        for i in range(1, here.n):
+            turning = i
+            if wp.static(NBALL > 0):
+                turning = m.inboard[here.at + i]
+            motions[i].C = wp.spatial_cross(links[turning].V, links[i].S * links[i].qd)
+        for i in range(1, INERT + 1):
+            loads[i] = Load()
+        for i in range(FIRST, here.n):
+            loads[i] = link_inertia(m, here, here.at + i, links[i], carrier)
 
-        adj_factors, here and in all laws, are written only if the spec is varied.
-        """
+    @wp.func
+    def link_adjoint(m: Model, here: Lane, k: int, link: Link, node: Node, carrier: CarrierPos):
+        """Compute the adjoints of link k's part of phi, about the carrier's position."""
         com, inertia = world_inertia(m, k, link)
         V = link.V
         W = node.W
@@ -80,8 +92,6 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             adj.w = adj.w - up
             adj.p = -sp.force_at(p, wp.cross(f, wp.spatial_top(W))) - wp.spatial_cross_dual(W, up)
         if wp.static(VARIED):
-            # phi's inertial part is W . adj_w. All of the above is for a factor of 1.
-            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj.w)
             adj.a = here.mass * adj.a
             adj.w = here.mass * adj.w
             adj.v = here.mass * adj.v
@@ -91,23 +101,23 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             adj.w = adj.w - drag.drag_wrench(m, k, link.R, com, V)
             adj.v = adj.v + drag.drag_adjoint(m, k, link.R, com, V, W)
         if wp.static(CONTACT):
-            adj = contact.add_contacts_adjoint(m, here, k, link, node, carrier, adj, adj_factors)
+            adj = contact.add_contacts_adjoint(m, here, k, link, node, carrier, adj)
         return adj
 
     @wp.func
-    def add_damping_adjoint(m: Model, here: Lane, k: int, link: Link, node: t.Node, adj: Adjoint, adj_factors: t.Ts):
+    def add_damping_adjoint(m: Model, here: Lane, k: int, link: Link, node: t.Node, adj: Adjoint):
         """Add the adjoints of D and W1 in phi's part W1 . I D, where damping follows the constraints."""
         com, inertia = world_inertia(m, k, link)
         adj.d = momentum(T(m.mass[k]), com, inertia, node.W1)
         adj.w1 = momentum(T(m.mass[k]), com, inertia, node.D)
         if wp.static(VARIED):
-            adj_factors[MASS] = adj_factors[MASS] + wp.dot(node.W1, adj.w1)
             adj.d = here.mass * adj.d
             adj.w1 = here.mass * adj.w1
         return adj
 
     @wp.func
     def add_adjoints(x: Adjoint, y: Adjoint):
+        """Return the sum of two adjoints."""
         x.a = x.a + y.a
         x.v = x.v + y.v
         x.w = x.w + y.w

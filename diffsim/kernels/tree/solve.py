@@ -28,6 +28,7 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def back_substitute(L: mat6, b: vec6):
+        """Return L'^-1 b, the second half of a solve with a Cholesky factor L."""
         a = b
         for rr in range(6):
             r = 5 - rr
@@ -64,6 +65,7 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def store_base(ck_f: t.array3, row: int, e: int, L: mat6):
+        """Store the base's Cholesky factor in a row of the checkpoint."""
         k = int(BASE)
         for r in range(6):
             for c in range(r + 1):

@@ -1,4 +1,4 @@
-"""progress.csv, tensorboard and the statistics of episodes."""
+"""progress.csv and tensorboard."""
 
 from __future__ import annotations
 
@@ -9,13 +9,7 @@ import pytest
 from learners import read_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from diffsim.training.directory import (
-    COLUMNS,
-    EpisodeStatistics,
-    ProgressFile,
-    ProgressLog,
-    say,
-)
+from diffsim.training.log import COLUMNS, ProgressFile, ProgressLog, say
 
 
 def row(iteration: int, **values: float) -> dict[str, float]:
@@ -74,22 +68,6 @@ def test_a_crash_while_columns_join_leaves_the_old_file(tmp_path: Path, monkeypa
         patch.setattr("os.replace", crash)
         file.write(row(2, eval=1.0))
     assert path.read_text() == before
-
-
-def test_episode_statistics_are_of_the_newest_rollouts_with_a_hundred_episodes() -> None:
-    statistics = EpisodeStatistics()
-    statistics.add(0, 0.0, 0.0)
-    assert not statistics.rollouts
-    statistics.add(60, 600.0, 6000.0)
-    assert statistics.means() == (10.0, 100.0)
-    statistics.add(30, 600.0, 3000.0)
-    assert statistics.means() == (1200 / 90, 100.0)
-    statistics.add(70, 700.0, 700.0)  # with the second as many as a hundred: the first is forgotten
-    assert statistics.means() == (1300 / 100, 3700 / 100)
-    statistics.add(0, 0.0, 0.0)
-    assert statistics.means() == (1300 / 100, 3700 / 100)
-    statistics.add(500, 500.0, 500.0)
-    assert statistics.means() == (1.0, 1.0)
 
 
 def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.elements import disabled_flags
-from diffsim.robot.scene import Array
+from diffsim.robot.types import Array
 
 HULL_POINTS = 16  # of a mesh, at most
 _CORNERS = np.array([[x, y, z] for y in (-1, 1) for x in (-1, 1) for z in (-1, 1)], float)

@@ -1,7 +1,7 @@
 """MuJoCo's constraints of a robot, from its file's solref, solimp, friction, margin and frictionloss.
 
 Nothing here is fitted. MuJoCo's documentation, "Computation", defines the law;
-kernels/mujoco/constraint.py has the equations.
+kernels/mujoco/impedance.py has the equations.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim.robot.contact import ground_pairs, pair_law
-from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
+from diffsim.robot.contacts import ground_pairs, pair_law
+from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed, takes_euler
 from diffsim.robot.pairs import GEOMS, Pairs, rows_of
-from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene, SceneError, takes_euler
+from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
+from diffsim.robot.types import Array, SceneError
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5

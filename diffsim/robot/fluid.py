@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffsim.robot.scene import Array, Scene
+from diffsim.robot.scene import Scene
+from diffsim.robot.types import Array
 
 
 def drag(scene: Scene) -> tuple[Array, Array, Array, Array]:

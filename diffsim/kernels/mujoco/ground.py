@@ -1,19 +1,4 @@
-"""MuJoCo's regularised constraints: contact, joint limits and dry friction, and their adjoints.
-
-A row of MuJoCo's constraints has a force that depends on the acceleration a of the robot by
-
-    jar = J a + b v + k d(r) r,   D = d(r) / ((1 - d(r)) w),
-
-with v the row's velocity, r < 0 its violation of the margin, d(r) its impedance (`solimp`), k and b from `solref`, and
-w its inverse weight. J a - jar is MuJoCo's aref. MuJoCo leaves dJ/dt v out of J a. So J a is the velocity of the twists
-B that the links would have if the joints' velocities were their accelerations. A limit has the force -D jar where
-jar < 0, dry friction -D jar bounded by +-eta, a contact the three numbers of cone.py. All are linear in a within
-their zones, with slope -H. So a Newton step of MuJoCo's convex problem,
-
-    (M + J'HJ) (a_new - a) = tau + J'f(a) - M a,
-
-is one pass of the articulated-body algorithm with each contact's block X'HX added to its link's inertia, and D to its
-joint's: `add_contacts` and `joint_constraint`.
+"""Contacts of spheres with the ground by MuJoCo's law (impedance.py, cone.py), and their adjoint.
 
 On a terrain (terrain.py) a contact's law and its adjoint act in the frame E of the feature that the sphere touches.
 
@@ -26,8 +11,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.laws.terrain import terrain_contact
-from diffsim.kernels.mujoco.cone import elliptic_cone, pyramidal_cone
-from diffsim.kernels.thread.lane import K_D, K_N, MU
+from diffsim.kernels.mujoco.cone import friction_cone
+from diffsim.kernels.mujoco.impedance import impedance_law
+from diffsim.kernels.thread.columns import CONTACT
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
@@ -47,44 +33,21 @@ def contact_room(spec: KernelSpec) -> int:
 
 
 def pair_column(spec: KernelSpec) -> int:
-    """Return the checkpoint's first column of pairs.py, after accelerations and the lanes' contacts with the ground."""
+    """Return the checkpoint's first column of pairs/, after accelerations and the lanes' contacts with the ground."""
     return 2 * spec.nv + 4 * contact_room(spec) * spec.threads_per_env
 
 
 @cache
-def constraint_law(spec: KernelSpec) -> SimpleNamespace:
-    t, sp, block = types(spec), spatial(spec), blocks(spec)
-    T, U, vec2, vec3, vec4, vec6, mat3 = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3
-    Params, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
-    Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
-    CarrierPos, Frame, ground, FRAMED = t.CarrierPos, t.Frame, terrain_contact(spec), spec.framed
-    (TERRAIN, PYRAMID, BOX), ROOM = spec.has("terrain pyramid box"), contact_room(spec)
-    cone = pyramidal_cone(spec) if PYRAMID else elliptic_cone(spec)
-    in_frame, in_world = ground.in_frame, ground.in_world
-    LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
-    LEARNED, COLUMNS = spec.parameters > 0, spec.parameters - 2 * (spec.spheres + spec.pairs)  # see parameters.py
-
-    @wp.func
-    def impedance_row(c: Params, stiffness: T, r: T):
-        """Return (D, D' / D, k d r, (k d r)'), primes with respect to r <= 0; stiffness is a factor of k."""
-        x = wp.min(-r / T(c[7]), T(1.0))
-        middle, power = T(c[8]), T(c[9])
-        if c[9] == U(2.0):
-            low = x * x / middle
-            low_slope = T(2.0) * x / middle
-            high = T(1.0) - (T(1.0) - x) * (T(1.0) - x) / (T(1.0) - middle)
-            high_slope = T(2.0) * (T(1.0) - x) / (T(1.0) - middle)
-        else:
-            low_slope = power * wp.pow(x / middle, power - T(1.0))
-            high_slope = power * wp.pow((T(1.0) - x) / (T(1.0) - middle), power - T(1.0))
-            low = low_slope * x / power
-            high = T(1.0) - high_slope * (T(1.0) - x) / power
-        rise = T(c[6]) - T(c[5])
-        d = T(c[5]) + rise * pick(middle, x, high, low)
-        slope = -rise / T(c[7]) * pick(x, T(1.0), pick(middle, x, high_slope, low_slope), T(0.0))
-        k = stiffness * T(c[0])
-        rest = T(1.0) - d
-        return vec4(d / (rest * T(c[4])), slope / (d * rest), k * d * r, k * (d + slope * r))
+def ground_contact(spec: KernelSpec) -> SimpleNamespace:
+    """Make the functions of contacts with the ground in Newton's method."""
+    t, sp, block, kin = types(spec), spatial(spec), blocks(spec), kinematics(spec)
+    T, U, vec3, vec4, vec6, mat3 = t.T, t.U, t.vec3, t.vec4, t.vec6, t.mat3
+    force_at, point_velocity, pick = sp.force_at, sp.point_velocity, block.pick
+    Model, Link, Load, Lane, CarrierPos, Frame = t.Model, t.Link, t.Load, t.Lane, t.CarrierPos, t.Frame
+    terrain, impedance, cone = terrain_contact(spec), impedance_law(spec), friction_cone(spec)
+    in_frame, in_world = terrain.in_frame, terrain.in_world
+    (PYRAMID, BOX), FRAMED, VARIED = spec.has("pyramid box"), spec.framed, spec.varied
+    NV, ROOM = spec.nv, contact_room(spec)
 
     @wp.func
     def locate_contact(m: Model, here: Lane, c: int, link: Link, carrier: CarrierPos):
@@ -96,7 +59,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         """
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         reach = T(m.contact_radius[c] + m.contact_params[c][10])
-        distance, E, curvature = ground.distance(m, here, c, centre, carrier, reach)
+        distance, E, curvature = terrain.distance(m, here, c, centre, carrier, reach)
         active = pick(distance, T(m.contact_params[c][10]), T(1.0), T(0.0))
         if wp.static(BOX):  # of a box MuJoCo takes the corners of the lower half
             if m.contact_radius[c] == U(0.0):
@@ -119,7 +82,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         # The point lies midway between the two surfaces.
         p = centre - in_world(E, vec3(T(0.0), T(0.0), T(m.contact_radius[c]) + T(0.5) * distance))
         coef = contact_constants(m, here, c)
-        state = impedance_row(params, coef[0], wp.min(distance - T(params[10]), T(0.0)))
+        state = impedance.impedance_row(params, coef[0], wp.min(distance - T(params[10]), T(0.0)))
         jar = in_frame(E, point_velocity(B, p) + coef[1] * point_velocity(V, p)) + vec3(T(0.0), T(0.0), state[2])
         D = active * state[0]
         if wp.static(VARIED):
@@ -192,32 +155,11 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return load
 
     @wp.func
-    def acceleration_for(force_error: vec3, w: T, H: mat3):
-        """Return (1 / w + H)^-1 force_error, the acceleration that corrects the error of a force.
-
-        I + w H has pivots of 1 or more.
-        """
-        G = w * H
-        x = w * force_error
-        d = T(1.0) / (T(1.0) + G[0, 0])
-        y = d * G[1, 0]
-        z = d * G[2, 0]
-        e = G[2, 1] - z * G[1, 0]
-        x[1] = x[1] - y * x[0]
-        x[2] = x[2] - z * x[0]
-        c = T(1.0) / wp.max(T(1.0) + G[1, 1] - y * G[1, 0], T(1.0))
-        v = c * e
-        x[2] = (x[2] - v * x[1]) / wp.max(T(1.0) + G[2, 2] - z * G[2, 0] - v * e, T(1.0))
-        x[1] = c * x[1] - v * x[2]
-        x[0] = d * x[0] - y * x[1] - z * x[2]
-        return x
-
-    @wp.func
     def trial_contacts(
         m: Model, here: Lane, begin: int, end: int, step: vec6, alpha: T, evaluation: int, contacts: t.Contacts
     ):
-        """Evaluate a link's contacts after the trial step alpha step; returns their part of newton.evaluate_trial."""
-        total = vec6()
+        """Evaluate a link's contacts after the trial step alpha step; returns their Trial."""
+        total = t.Trial()
         for s in range(begin, end):
             c = contacts[s].sphere
             step_jar = point_velocity(step, contacts[s].p)
@@ -230,15 +172,12 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             f, H = cone.force(contacts[s].D, friction, T(m.contact_params[c][3]), jar, T(0.0))
             force_error = contacts[s].f - alpha * contacts[s].Hs - f
             w = T(m.contact_params[c][4])
-            accel_error = acceleration_for(force_error, w, H)
-            total = total + vec6(
-                wp.dot(step_jar, force_error),
-                wp.dot(step_jar, contacts[s].Hs),
-                wp.dot(step_jar, H * step_jar),
-                wp.dot(accel_error, accel_error),
-                w * wp.trace(H),
-                T(0.0),
-            )
+            accel_error = impedance.acceleration_for(force_error, w, H)
+            total.slope = total.slope + wp.dot(step_jar, force_error)
+            total.linear = total.linear + wp.dot(step_jar, contacts[s].Hs)
+            total.curvature = total.curvature + wp.dot(step_jar, H * step_jar)
+            total.error_sq = total.error_sq + wp.dot(accel_error, accel_error)
+            total.stiffness = total.stiffness + w * wp.trace(H)
             contacts[s].trial_jar = jar
             contacts[s].trial_force = f
             contacts[s].H = H
@@ -246,7 +185,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def accept_contacts(begin: int, end: int, contacts: t.Contacts):
-        """Accept the last trial step of contacts, with the ground or of pairs.py."""
+        """Accept the last trial step of contacts, with the ground or between bodies."""
         for s in range(begin, end):
             contacts[s].jar = contacts[s].trial_jar
             contacts[s].f = contacts[s].trial_force
@@ -266,6 +205,20 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 kin.store(ck.a, here.row, column + 1 + r, here.e, contacts[s].jar[r])
         if number < ROOM:
             kin.store(ck.a, here.row, 2 * NV + 4 * (ROOM * here.lane + number), here.e, T(-1.0))
+
+    return functions(locals())
+
+
+@cache
+def ground_adjoint(spec: KernelSpec) -> SimpleNamespace:
+    """Make the adjoint of contacts with the ground, at the jar that the checkpoint has."""
+    t, sp, block, kin, ground = types(spec), spatial(spec), blocks(spec), kinematics(spec), ground_contact(spec)
+    T, vec3, Model, Lane, Link, CarrierPos = t.T, t.vec3, t.Model, t.Lane, t.Link, t.CarrierPos
+    force_at, point_velocity = sp.force_at, sp.point_velocity
+    in_frame, in_world, cone = terrain_contact(spec).in_frame, terrain_contact(spec).in_world, friction_cone(spec)
+    (TERRAIN, PYRAMID), FRAMED = spec.has("terrain pyramid"), spec.framed
+    NV, ROOM = spec.nv, contact_room(spec)
+    LEARNED, COLUMNS = spec.parameters > 0, spec.columns.ground
 
     @wp.func
     def recorded_sphere(here: Lane, s: int, ck: t.Checkpoint):
@@ -289,35 +242,28 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         ck: t.Checkpoint,
         # adjoints in and out
         adj: t.Adjoint,
-        adj_factors: t.Ts,
+        adj_parameters: t.Ts,
     ):
         """Add the contacts' part of phi to link k's adjoints; returns them, and the next link's first contact."""
         c = recorded_sphere(here, s, ck)
         while c >= 0 and c < m.contact_begin[k + 1]:
-            centre, distance, active, feature, curvature = locate_contact(m, here, c, link, carrier)
+            centre, distance, active, feature, curvature = ground.locate_contact(m, here, c, link, carrier)
             E = feature
             if wp.static(PYRAMID):
                 heading = cone.heading(m, c, link.R, feature)
                 E = feature * cone.frame(heading)
-            p, _, state, coef = contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
+            p, _, state, coef = ground.contact_state(m, here, c, centre, distance, active, E, link.V, node.B)
             jar = vec3()
             for r in range(3):
                 jar[r] = kin.load(ck.a, here.row, 2 * NV + 4 * (ROOM * here.lane + s) + 1 + r, here.e)
             f, H = cone.force(state[0], coef[2], T(m.contact_params[c][3]), jar, T(0.0))
             w = in_frame(E, point_velocity(node.W, p))
-            velocity = in_frame(E, point_velocity(link.V, p))
             g_jar = H * w
             g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
-            if wp.static(VARIED):
-                by_k = T(0.5) * coef[1] * wp.dot(g_jar, velocity) + g_jar[2] * state[2]
-                by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                adj_factors[K_N] = adj_factors[K_N] + by_k / coef[0]
-                adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
-                adj_factors[MU] = adj_factors[MU] - T(m.contact_params[c][2]) * by_mu
             if wp.static(LEARNED):
                 by_mu = cone.friction_derivative(state[0], coef[2], T(m.contact_params[c][3]), jar, w)
-                adj_factors[COLUMNS + 2 * c] = adj_factors[COLUMNS + 2 * c] - by_mu
-                adj_factors[COLUMNS + 2 * c + 1] = adj_factors[COLUMNS + 2 * c + 1] + wp.dot(f, w)
+                adj_parameters[COLUMNS + CONTACT * c] = adj_parameters[COLUMNS + CONTACT * c] - by_mu
+                adj_parameters[COLUMNS + CONTACT * c + 1] = adj_parameters[COLUMNS + CONTACT * c + 1] + wp.dot(f, w)
             if wp.static(FRAMED):  # adjoint of a rotation of the frame
                 g_turn = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, w)
             if wp.static(PYRAMID):
@@ -345,70 +291,5 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             s = s + 1
             c = recorded_sphere(here, s, ck)
         return adj, s
-
-    @wp.func
-    def limit_row(m: Model, here: Lane, i: int, q: T):
-        """Return the limit's impedance_row, with D = 0 within the range, and the sign of its J."""
-        params = m.limit_params[i]
-        low = q - T(m.lower[i])
-        high = T(m.upper[i]) - q
-        r = wp.min(low, high) - T(params[10])
-        stiffness = T(1.0)
-        if wp.static(VARIED):
-            stiffness = here.k_limit
-        state = impedance_row(params, stiffness, wp.min(r, T(0.0)))
-        active = pick(r, T(0.0), T(1.0), T(0.0))
-        return vec4(active * state[0], state[1], state[2], state[3]), pick(low, high, T(1.0), T(-1.0))
-
-    @wp.func
-    def limit_damping(m: Model, here: Lane, i: int):
-        b = T(m.limit_params[i][1])
-        if wp.static(VARIED):
-            b = wp.sqrt(here.k_limit) * b
-        return b
-
-    @wp.func
-    def limit_state(m: Model, here: Lane, i: int, q: T, qd: T):
-        """Return the limit's (D, jar without acceleration, sign of J)."""
-        state, sign = limit_row(m, here, i, q)
-        return vec3(state[0], sign * limit_damping(m, here, i) * qd + state[2], sign)
-
-    @wp.func
-    def joint_constraint(m: Model, i: int, limit: vec3, qd: T, qdd: T, sticking: T):
-        """Return the force of the limit and of dry friction on the joint, and minus its derivative in qdd.
-
-        Where sticking is 1, the limit has its slope whatever jar is.
-        """
-        force = T(0.0)
-        slope = T(0.0)
-        if wp.static(LIMIT):
-            jar = limit[2] * qdd + limit[1]
-            slope = pick(jar, T(0.0), limit[0], sticking * limit[0])
-            force = -limit[2] * slope * jar
-        if wp.static(LOSS):
-            loss = m.joint_loss[i]
-            f = -T(loss[1]) * (qdd + T(loss[2]) * qd)
-            eta = T(loss[0])
-            force = force + wp.max(wp.min(f, eta), -eta)
-            slope = slope + pick(wp.abs(f), eta, T(loss[1]), T(0.0))
-        return vec2(force, slope)
-
-    @wp.func
-    def joint_derivatives(m: Model, here: Lane, i: int, q: T, qd: T, qdd: T):
-        """Differentiate that force with respect to q, qd and the factor of k_limit."""
-        derivatives = vec3()
-        if wp.static(LIMIT):
-            state, sign = limit_row(m, here, i, q)
-            b = limit_damping(m, here, i)
-            jar = sign * (qdd + b * qd) + state[2]
-            D = pick(jar, T(0.0), state[0], T(0.0))
-            derivatives = -D * vec3(state[3] + jar * state[1], b, T(0.0))
-            if wp.static(VARIED):
-                derivatives[2] = -D * (T(0.5) * b * qd + sign * state[2]) / here.k_limit
-        if wp.static(LOSS):
-            loss = m.joint_loss[i]
-            f = T(loss[1]) * (qdd + T(loss[2]) * qd)
-            derivatives[1] = derivatives[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
-        return derivatives
 
     return functions(locals())
