@@ -82,3 +82,12 @@ def test_factories_of_kernels_are_short(room: str) -> None:
 def test_files_of_robots_and_of_kernels_have_different_names() -> None:
     kernels = {path.name for path in KERNELS.rglob("*.py")} - {"__init__.py"}
     assert not kernels & {path.name for path in (ROOT / "diffsim/robot").glob("*.py")}
+
+
+def test_files_of_robots_import_each_other_in_no_circle() -> None:
+    """Not for their types either."""
+    files = {f"diffsim.robot.{path.stem}": set(imports(path)) for path in (ROOT / "diffsim/robot").glob("*.py")}
+    while free := [name for name, needed in files.items() if not needed & files.keys()]:
+        for name in free:
+            del files[name]
+    assert not files

@@ -15,7 +15,7 @@ import torch
 from scenes import free_states, parse, pendulum, random_tree, robot
 from test_constraint import CONES, STATES, H, check_gradients, in_mujoco, mujoco_model, step
 
-from diffsim.robot import pairs as robot_pairs
+from diffsim.robot import types
 from diffsim.robot.constants import constrained
 from diffsim.robot.pairs import with_pairs
 from diffsim.robot.scene import FACTORS
@@ -581,7 +581,7 @@ def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
         depth = {pair: -contact.dist for pair, contact in zip(ends, data.contact, strict=True) if pair in pairs}
         touching.append(sorted(depth, key=depth.get))
     numbers = np.array([len(each) for each in touching])
-    monkeypatch.setattr(robot_pairs, "MOST_PAIRS", 2)
+    monkeypatch.setattr(types, "MOST_PAIRS", 2)
     _, qvel, residual = step(scene, states)
     assert ((residual > 1e-4) == (numbers > 2)).all() and 2 in numbers
     for k in np.flatnonzero(numbers > 2).tolist():

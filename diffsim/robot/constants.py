@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from diffsim.robot.contacts import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed, takes_euler
-from diffsim.robot.pairs import GEOMS, Pairs, rows_of
+from diffsim.robot.pairs import rows_of
 from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
-from diffsim.robot.types import Array, SceneError
+from diffsim.robot.types import Array, Constraints, SceneError
 
 # MuJoCo's bounds of an impedance, and of the friction of a contact with friction
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
@@ -28,23 +27,6 @@ MOST_NUMBER = 1e15  # of a constraint's constants, whose squares single precisio
 IMPEDANCE = slice(5, 8)  # of a row of constants: the impedance's ends and width
 SOFT = 0.015  # impedance with which a contact of a chosen onset begins, that of Menagerie's Go1 and Go2
 LEAST_SOFTNESS = 1e-6  # of a pyramid's edges, at which Newton's method fails in single precision
-
-
-class Constraints(NamedTuple):
-    """Parameters of MuJoCo's constraints, for one length of a substep."""
-
-    # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
-    # midpoint and power; margin [m]
-    contact: Array
-    axis: Array  # (nc, 3) see Spheres
-    limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
-    loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
-    pairs: Pairs | None = None  # rows between two bodies, see robot/pairs.py
-
-    @property
-    def rough(self) -> bool:
-        """Tell whether a contact has friction."""
-        return bool(self.contact[:, 2].any() or (self.pairs and self.pairs.params[self.pairs.kind == GEOMS, 2].any()))
 
 
 def constrained(scene: Scene, seconds: float, single: bool = True, onset: float = 0.0) -> Scene:

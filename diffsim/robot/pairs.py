@@ -4,104 +4,42 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from diffsim.robot.contacts import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
 from diffsim.robot.scene import Scene
 from diffsim.robot.shapes import as_primitives, is_exact, obstacle_geoms
-from diffsim.robot.types import Array, Index, SceneError
+from diffsim.robot.types import (
+    BALL_BOX,
+    BOXES,
+    CAPSULE_BOX,
+    CONTACTS,
+    GEOMS,
+    JOINT,
+    PARALLEL,
+    POINT,
+    SEGMENTS,
+    TURN,
+    Array,
+    Pairs,
+    SceneError,
+)
 
 Row = Callable[[Array, Array, float, str], Array]  # solref, solimp, inverse weight and a name for messages
 Touch = Callable[[int, int], Array]  # two geoms
-JOINT, POINT, TURN, GEOMS = range(4)  # kinds of blocks, see kernels/pairs/rows.py
-NAMES = "joint", "point", "turn", "geoms"
 _Geom = mujoco.mjtGeom
-# Kinds of two geoms: parallel capsules, spheres and capsules, a sphere and a box, a capsule and a box, two boxes
-PARALLEL, SEGMENTS, BALL_BOX, CAPSULE_BOX, BOXES = range(-1, 4)
-CONTACTS = {PARALLEL: 2, SEGMENTS: 1, BALL_BOX: 1, CAPSULE_BOX: 2, BOXES: 8}  # at most, of a pair
 KINDS = {
     (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CAPSULE): PARALLEL,  # SEGMENTS if they are not parallel, see first_poses
     (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_BOX): BALL_BOX,
     (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_BOX): CAPSULE_BOX,
     (_Geom.mjGEOM_BOX, _Geom.mjGEOM_BOX): BOXES,
 }
-FEATURES = {
-    PARALLEL: "parallel_geoms",
-    BALL_BOX: "ball_box_geoms",
-    CAPSULE_BOX: "capsule_box_geoms",
-    BOXES: "box_geoms",
-}
 STRAIGHT = 1e-4  # sine between two capsules that are parallel
-MOST_PAIRS = 64  # contacts at once, in the environments that a thread steps together
 Frame = tuple[int, Array, Array]  # a link (-1: the world beside a floating base), a point and a rotation in its frame
-
-
-class PairSizes(NamedTuple):
-    """Sizes that the kernels' code depends on."""
-
-    equalities: int = 0  # number of blocks of equality, which come first
-    heads: int = 0  # number of these and of the first ones of two geoms, which come next
-    most: int = 1  # contacts of two geoms, at most
-    places: int = 0  # number of points of blocks, see Pairs.places
-    blocks: int = 0  # number of blocks in local arrays, of which the last ones are room for those of two geoms
-
-    @property
-    def last(self) -> int:
-        """Return the first element of that room."""
-        return self.blocks - self.most
-
-
-class Pairs(NamedTuple):
-    """Blocks of three rows between two bodies, each with a first and a second end; BLANK where a kind has no number."""
-
-    kind: Index  # (n,)
-    partner: Index  # (n,) the other block of a weld, the second one of two geoms, or itself
-    params: Array  # (n, 11) as Constraints.contact
-    link: Index  # (n, 2) of each end, -1 for the world beside a floating base
-    point: Array  # (n, 2, 3) m, in the link's frame
-    frame: Array  # (n, 2, 3, 3) orientation in the link's frame
-    ref: Array  # (n, 2) q_0 of a joint
-    polycoef: Array  # (n, 5) of a joint
-    torquescale: Array  # (n,) of a turn
-    size: Array  # (n, 2, 3) m, of a geom as MuJoCo's
-    touch: Index  # (n,) kind of two geoms
-    contacts: Index  # (n,) how many two geoms may have, 0 in all their blocks but the first
-    reach_sq: Array  # (n,) m^2, square of the distance of two geoms' centres within which they may touch
-
-    @property
-    def features(self) -> frozenset[str]:
-        """Return the names of the kinds that are there, for Scene.features."""
-        kinds = set(self.touch[self.kind == GEOMS].tolist())
-        rows = frozenset(f"{NAMES[kind]}_rows" for kind in self.kind.tolist())
-        return rows | {name for kind, name in FEATURES.items() if kind in kinds}
-
-    @property
-    def geom_pairs(self) -> NDArray[np.int64]:
-        """Return which pair of geoms each block is of that belongs to one."""
-        contacts = self.contacts[self.contacts > 0]
-        heads = np.arange(len(contacts))
-        return np.r_[heads, heads.repeat(contacts - 1)]
-
-    @property
-    def places(self) -> tuple[Array, NDArray[np.int64]]:
-        """Return each point once, its link before its coordinates (m, 4), and which ones are a block's (n, 2)."""
-        all_of = np.concatenate((self.link[..., None], self.point), 2)
-        places, which = np.unique(all_of.reshape(-1, 4), axis=0, return_inverse=True)
-        return places, which.reshape(-1, 2)
-
-    @property
-    def sizes(self) -> PairSizes:
-        """Return sizes of the kernels' arrays."""
-        equalities, number = int((self.kind != GEOMS).sum()), len(self.kind)
-        heads, most = equalities + int((self.contacts > 0).sum()), int(self.contacts.max(initial=1))
-        return PairSizes(equalities, heads, most, len(self.places[0]), min(number, equalities + MOST_PAIRS) + most)
-
-
 # The numbers of a block that its kind does not have
 BLANK: dict[str, Any] = {"ref": np.zeros(2), "polycoef": np.zeros(5), "torquescale": 0.0, "size": np.zeros((2, 3))}
 BLANK |= {"touch": SEGMENTS, "contacts": 0, "reach_sq": 0.0}

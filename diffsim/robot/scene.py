@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,11 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.elements import takes_euler
 from diffsim.robot.profile import TerrainError, check_terrain
-from diffsim.robot.types import Array, Index, Transmissions
-
-if TYPE_CHECKING:
-    from diffsim.robot.constants import Constraints
-    from diffsim.robot.pairs import Pairs
+from diffsim.robot.types import Array, Constraints, Index, Pairs, Transmissions
 
 # Constants of soft contact (Eq. 3) and limits (Eq. 4), with their units. In the MJCF
 # <custom><numeric name="k_n" data="2e4"/></custom> sets one.

@@ -1,6 +1,6 @@
 """The adjoint of rows between two bodies (rows.py).
 
-It begins at phi = -f . rate with rate the rows' velocity under lambda, as for contacts (constraint.py). Newton's matrix
+It begins at phi = -f . rate with rate the rows' velocity under lambda, as for contacts (ground.py). Newton's matrix
 is symmetric, so lambda takes the same conjugate gradients as a step of Newton's method (solver.py).
 """
 
@@ -23,7 +23,7 @@ from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.tree.branches import branch_solver
 from diffsim.kernels.tree.kinematics import kinematics
-from diffsim.robot.pairs import GEOMS
+from diffsim.robot.types import GEOMS
 
 ACCURACY_ADJOINT = 1e-12, 1e-6  # as ACCURACY of rows.py, in float64 and in float32
 
@@ -108,7 +108,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     def geoms_adjoint(
         m: Model, here: Lane, c: int, rate: vec3, links: Links, contacts: Contacts, nodes: Nodes, adj: Adjoints
     ):
-        """Add the part of two geoms' block, with that rate under lambda, as constraint.add_contacts_adjoint."""
+        """Add the part of two geoms' block, with that rate under lambda, as ground.add_contacts_adjoint."""
         s = contacts[c].row
         i, j = J.ends(m, s)
         b = rows.constants(m, here, s)[1]

@@ -19,7 +19,7 @@ import warp as wp
 from diffsim.kernels.pairs.spheres import TINY, sphere_contacts
 from diffsim.kernels.pairs.touch import geom_types
 from diffsim.kernels.thread.model import functions
-from diffsim.robot.pairs import BOXES, CONTACTS
+from diffsim.robot.types import BOXES, CONTACTS
 
 # In float64 and in float32, as MuJoCo's
 AXIS_SQ = 1e-16, 1e-7  # square of the least sine between two edges whose cross product is an axis

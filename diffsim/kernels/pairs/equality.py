@@ -19,7 +19,7 @@ from diffsim.kernels.pairs.jacobian import pair_jacobian
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
-from diffsim.robot.pairs import JOINT, POINT, TURN
+from diffsim.robot.types import JOINT, POINT, TURN
 
 LEAST = 1e-12  # of 4 w^2, at a rotation by half a turn
 

@@ -12,7 +12,7 @@ from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
-from diffsim.robot.pairs import JOINT, POINT, TURN
+from diffsim.robot.types import JOINT, POINT, TURN
 
 SMALLEST = 1e-12  # of a violation whose direction is defined
 

@@ -17,7 +17,7 @@ from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
-from diffsim.robot.pairs import BALL_BOX, BOXES, CAPSULE_BOX, PARALLEL
+from diffsim.robot.types import BALL_BOX, BOXES, CAPSULE_BOX, PARALLEL
 
 
 @cache
@@ -72,7 +72,7 @@ def pair_geoms(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
 
     @wp.func
     def collide(kind: int, first: Geom, second: Geom, margin: U, found: Touches):
-        """Find the contacts of two geoms, a kind of robot/pairs.py, in one environment; returns their number."""
+        """Find the contacts of two geoms, a kind of robot/types.py, in one environment; returns their number."""
         if wp.static(TWO_BOXES):
             if kind == BOXES:
                 return boxes.box_box(first, second, margin, found)

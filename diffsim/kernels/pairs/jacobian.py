@@ -12,7 +12,7 @@ import warp as wp
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
-from diffsim.robot.pairs import JOINT, TURN
+from diffsim.robot.types import JOINT, TURN
 
 
 @cache

@@ -6,7 +6,7 @@ of the rows' forces, which takes the place of -H s in the line search (newton.py
 
 Equality has the force -D jar whatever its sign. Impedance and stiffness are those of the norm of its violation, which
 the two blocks of a weld share (MuJoCo's mj_instantiateEquality and mj_makeImpedance). Contacts of two geoms have the
-law of the ground's (constraint.py). The blocks that act are listed in each substep: without any, no time is spent.
+law of the ground's (ground.py). The blocks that act are listed in each substep: without any, no time is spent.
 """
 
 from functools import cache
@@ -26,7 +26,7 @@ from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
 from diffsim.kernels.tree.kinematics import kinematics
-from diffsim.robot.pairs import GEOMS, JOINT
+from diffsim.robot.types import GEOMS, JOINT
 
 ACCURACY = 1e-2  # of a Newton step: of its residual, in multiples of the iterate's, in the norm of T^-1
 

@@ -28,7 +28,7 @@ from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
 from diffsim.kernels.tree.branches import branch_solver
-from diffsim.robot.pairs import JOINT
+from diffsim.robot.types import JOINT
 
 # The search ends where p.z, the square of the residual in the norm of T^-1, is small in comparison with that of b, or
 # without another solve where the residual is as good as 0: this multiple of that goal in the rows' accelerations

@@ -15,7 +15,7 @@ from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
-from diffsim.robot.pairs import BALL_BOX, BOXES, CAPSULE_BOX
+from diffsim.robot.types import BALL_BOX, BOXES, CAPSULE_BOX
 
 # Least square of the sine between two segments for the adjoint of their nearest points, in float64 and in float32
 PARALLEL = 1e-12, 1e-6

@@ -176,7 +176,7 @@ FIELDS: dict[str, Field] = {
     "contact_begin": ("ints", lambda n: n.spheres[0]),  # of each entry, in the spheres
     "contact_position": ("vec3s", lambda n: n.scene.contact_position[n.spheres[1]]),  # m, centre in the link's frame
     "contact_radius": ("reals", lambda n: n.scene.contact_radius[n.spheres[1]]),  # m
-    # MuJoCo's constraints: rows of robot.constants.Constraints
+    # MuJoCo's constraints: rows of robot.types.Constraints
     "contact_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.contact[n.spheres[1]]),
     "contact_axis": ("vec3s", lambda n: n.scene.constraints and n.scene.constraints.axis[n.spheres[1]]),
     "limit_params": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.limit[n.link]),

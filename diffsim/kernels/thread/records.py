@@ -15,7 +15,7 @@ PAIR_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
         ("kind", "ints"),  # of each block
         ("touch", "ints"),  # kind of two geoms
         ("partner", "ints"),  # the block that shares its violation, or itself
-        ("params", "vec11s"),  # as rows of robot.constants.Constraints
+        ("params", "vec11s"),  # as rows of robot.types.Constraints
         ("polycoef", "vec5s"),  # of a joint
         ("torquescale", "reals"),  # of a turn
         ("reach_sq", "reals"),  # m^2, square of the distance of two geoms' centres within which they may touch

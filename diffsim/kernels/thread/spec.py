@@ -5,8 +5,8 @@ from typing import Any
 
 from diffsim.kernels.thread.columns import Columns
 from diffsim.kernels.thread.division import Division
-from diffsim.robot.pairs import PairSizes
 from diffsim.robot.scene import Scene
+from diffsim.robot.types import PairSizes
 
 FAR = 256.0  # m and rad, beyond which rounding a substep's motion to float32 matters
 MAX_POSITION = 1e5  # m and rad; beyond, float32 does not resolve a hundredth
