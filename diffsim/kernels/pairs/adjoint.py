@@ -1,7 +1,7 @@
-"""The adjoint of rows between two bodies (pairs.py).
+"""The adjoint of rows between two bodies (rows.py).
 
 It begins at phi = -f . rate with rate the rows' velocity under lambda, as for contacts (ground.py). Newton's matrix
-is symmetric, so lambda takes the same conjugate gradients as a step of Newton's method (pair_solver.py).
+is symmetric, so lambda takes the same conjugate gradients as a step of Newton's method (solver.py).
 """
 
 from functools import cache
@@ -25,7 +25,7 @@ from diffsim.kernels.tree.branches import branch_solver
 from diffsim.kernels.tree.kinematics import kinematics
 from diffsim.robot.types import GEOMS
 
-ACCURACY_ADJOINT = 1e-12, 1e-6  # as ACCURACY of pairs.py, in float64 and in float32
+ACCURACY_ADJOINT = 1e-12, 1e-6  # as ACCURACY of rows.py, in float64 and in float32
 
 
 @cache

@@ -151,6 +151,7 @@ def box_contacts(U: type) -> SimpleNamespace:
         face = best
         face_number = number
         axis = vec3()
+        edges, bias = int(EDGES), U(EDGE_BIAS)  # here, as Warp reads a named constant only where it first appears
         for k in range(9):
             e = vec3()
             e[k // 3] = U(1.0)
@@ -161,9 +162,9 @@ def box_contacts(U: type) -> SimpleNamespace:
                 gap = wp.abs(wp.dot(n, d)) - extent(one.size, n) - extent(other.size, wp.transpose(Q) * n)
                 if gap > reach:
                     return APART, d
-                if gap > face and gap - U(EDGE_BIAS) * wp.abs(gap) > best:
+                if gap > face and gap - bias * wp.abs(gap) > best:
                     best = gap
-                    number = EDGES + k
+                    number = edges + k
                     axis = n
         normal = vec3()
         if face_number < 3:

@@ -43,11 +43,11 @@ def box_features(U: type) -> SimpleNamespace:
         """Find what of a box with the half lengths b is nearest to a capsule's axis."""
         feature = Feature()
         best = U(FAR)
+        same, edge = U(same_sq), int(EDGE)  # here, as Warp reads a named constant only where it first appears
         for k in range(2):
             end = U(2.0 * float(k) - 1.0)
             square = U(0.0)
-            outside = int(0)
-            axis = int(0)
+            outside, axis = int(0), int(0)
             for i in range(3):
                 beyond = wp.abs(y[i] + end * h[i]) - b[i]
                 if beyond > U(0.0):
@@ -61,9 +61,7 @@ def box_features(U: type) -> SimpleNamespace:
                 feature.s = end
         hh = wp.dot(h, h)
         for j in range(3):
-            low = int(0)  # the first of the two other axes: of equally near edges MuJoCo has the first in this order
-            if j == 0:
-                low = 1
+            low = wp.where(j == 0, 1, 0)  # the first of the other axes: of equally near edges MuJoCo has the first
             along = vec3()
             along[j] = b[j]
             det = b[j] * b[j] * hh - b[j] * h[j] * (b[j] * h[j])
@@ -80,29 +78,28 @@ def box_features(U: type) -> SimpleNamespace:
                 for i in range(3):
                     beyond = wp.max(wp.abs(gap[i]) - wp.abs(h[i]) - along[i], U(0.0))
                     bound = bound + beyond * beyond
-                if skew and bound < best - U(same_sq):
+                if skew and bound < best - same:
                     # nearest points middle + at along and y + s h; it is a corner, too, if both lines' are beyond it
-                    u = -b[j] * gap[j]
-                    v = wp.dot(h, gap)
+                    u, v = -b[j] * gap[j], wp.dot(h, gap)
                     at = (hh * u + b[j] * h[j] * v) / det
                     s = (b[j] * b[j] * v + b[j] * h[j] * u) / det
-                    kind = int(EDGE)
+                    corner = int(0)
                     side = at
                     if wp.abs(at) > U(1.0):
-                        kind = int(CORNER)
+                        corner = 1
                         at = wp.sign(at)
                         s = (v + at * b[j] * h[j]) / hh
                     if wp.abs(s) > U(1.0):
                         s = wp.sign(s)
                         at = (u + s * b[j] * h[j]) / (b[j] * b[j])
                         if wp.abs(at) > U(1.0):
-                            kind = int(CORNER)
+                            corner = 1
                             side = at
                             at = wp.sign(at)
                     d = gap + at * along - s * h
-                    if wp.dot(d, d) < best - U(same_sq):
+                    if wp.dot(d, d) < best - same:
                         best = wp.dot(d, d)
-                        feature.kind = kind
+                        feature.kind = edge + corner
                         feature.axis = j
                         feature.s = s
                         feature.point = middle + at * along
@@ -144,11 +141,12 @@ def capsule_contacts(U: type) -> SimpleNamespace:
         Returns:
             its direction, 1 or -1, or 0 if there is none; and for each axis of the box what ends it: WHOLE, SIDE or 0.
         """
+        whole, side = int(WHOLE), int(SIDE)  # here, as Warp reads a named constant only where it first appears
         way = U(0.0)
         ends = wp.vec3i(0, 0, 0)
         if feature.kind == FACE:
             way = -feature.s
-            ends = wp.vec3i(SIDE, SIDE, SIDE)
+            ends = wp.vec3i(side, side, side)
             ends[feature.axis] = 0
         if feature.kind < EDGE:
             return way, ends
@@ -163,8 +161,8 @@ def capsule_contacts(U: type) -> SimpleNamespace:
                 main = (feature.axis + 1) % 3
             if differs[0] + differs[1] + differs[2] == 1:
                 way = U(2.0 * float(differs[main]) - 1.0)
-                ends[main] = WHOLE
-                ends[feature.axis] = SIDE
+                ends[main] = whole
+                ends[feature.axis] = side
             return way, ends
         # from a corner along the edge whose axis is the odd one out, or over the face of the other two
         count = differs[0] + differs[1] + differs[2]
@@ -175,10 +173,10 @@ def capsule_contacts(U: type) -> SimpleNamespace:
                     odd = i
             way = U(3.0 - 2.0 * float(count))
             if h[odd] * h[odd] > U(0.5) * wp.dot(h, h):
-                ends[odd] = WHOLE
+                ends[odd] = whole
             else:
                 way = -way
-                ends = wp.vec3i(WHOLE, WHOLE, WHOLE)
+                ends = wp.vec3i(whole, whole, whole)
                 ends[odd] = 0
         return way, ends
 

@@ -1,4 +1,4 @@
-"""Lists the rows between two bodies that act in a substep, and places them (pairs.py).
+"""Lists the rows between two bodies that act in a substep, and places them (rows.py).
 
 Two geoms have as many blocks of rows as they may have contacts, whose first one comes with the other pairs' first ones
 and stands for all of them until their bounding spheres meet. If there is no room for all, the deepest ones are kept.

@@ -1,7 +1,7 @@
-"""Rows of MuJoCo's constraints between two bodies: equality and contacts. pair_adjoint.py has their adjoint.
+"""Rows of MuJoCo's constraints between two bodies: equality and contacts. adjoint.py has their adjoint.
 
 A row has J a of the links' accelerations (jacobian.py). Its force acts on both links, so
-Newton's matrix leaves the tree, and conjugate gradients take part in each pass (pair_solver.py). They find the change
+Newton's matrix leaves the tree, and conjugate gradients take part in each pass (solver.py). They find the change
 of the rows' forces, which takes the place of -H s in the line search (newton.py). So that one accounts for their error.
 
 Equality has the force -D jar whatever its sign. Impedance and stiffness are those of the norm of its violation, which

@@ -48,9 +48,10 @@ def sphere_contacts(U: type) -> SimpleNamespace:
         mc = wp.dot(a2, a2)
         u = wp.dot(a1, x2 - x1)
         v = wp.dot(a2, x1 - x2)
+        det = wp.max(ma * mc - mb * mb, U(TINY))  # here, as Warp reads a named constant only where it first appears
         s1 = U(0.0)
         if ma > U(0.0):
-            s1 = clamped((mc * u + mb * v) / wp.max(ma * mc - mb * mb, U(TINY)))
+            s1 = clamped((mc * u + mb * v) / det)
         free = (v + mb * s1) / wp.max(mc, U(TINY))
         s2 = clamped(free)
         if s2 != free:

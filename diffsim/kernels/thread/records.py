@@ -139,7 +139,7 @@ def add_constraints(
             "w1": vec6,  # W1
         }
     if spec.pairs:
-        # A block of rows between two bodies, see pairs.py; p is its point on the second one
+        # A block of rows between two bodies, see rows.py; p is its point on the second one
         structs["Contact"] |= {
             "row": int,  # its index in Model's rows
             "q": vec3,  # its point on the first one
