@@ -10,6 +10,8 @@ import pytest
 import torch
 import warp as wp
 from scenes import BALL, DISTINCT, DRONE, HINGE, OSCILLATOR, acting_states, leg_scene, parse, run, task_scene, without
+from test_constraint import CONES
+from test_pairs import solids
 from warp._src.context import ModuleBuilder
 
 import diffsim
@@ -17,6 +19,7 @@ from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.thread.division import divide
 from diffsim.kernels.thread.spec import kernel_spec
+from diffsim.robot.constants import constrained
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
@@ -270,6 +273,46 @@ def source(scene, **optional):
     return re.sub(r"//.*", "", text)  # comments quote the Python source, branches that are not taken included
 
 
+def unset(text):
+    """Statements of Warp's C++ that read a number which only a branch before them sets.
+
+    Warp computes a named constant where a function has it first, and reads it from there on: also after the branch.
+    """
+    found, sets, branch = [], {}, ()
+    for number, line in enumerate(map(str.strip, text.splitlines())):
+        line = re.sub(r"^wp::assign\((var_\d+), (.*)\);", r"\1 = \2;", line)
+        is_set = re.match(r"(const [\w:]+ )?(var_\d+) = ", line)
+        value = line[is_set.end() :] if is_set else line
+        if line == "{" and not branch:
+            sets, branch = {}, (number,)  # a function's body
+        for name in re.findall(r"\bvar_\d+\b", value) if "wp::where(" not in line and branch else ():
+            if name in sets and not any(branch[: len(other)] == other for other in sets[name]):
+                found.append(line)
+        if is_set:
+            sets.setdefault(is_set[2], []).append(branch[: 1 if is_set[1] else None])
+        if line.startswith("}"):
+            branch = branch[:-1]
+        if line.endswith("{") and line != "{" and branch:
+            branch += (number,)
+    return found
+
+
+def test_what_a_branch_leaves_unset_is_found():
+    code = "static void f(wp::float64 var_x)\n{\nif (var_0) {\nvar_1 = 1e-15;\n}\nvar_2 = wp::max(var_x, var_1);\n}\n"
+    assert unset(code) == ["var_2 = wp::max(var_x, var_1);"]
+    for mended in (code.replace("if (var_0) {\n", "").replace("}\nvar_2", "var_2"), code.replace("max", "where")):
+        assert unset(mended) == []
+
+
+@pytest.mark.parametrize("name", ["ant", "go2", "hills", "varied", "drone", *CONES])
+def test_kernels_read_what_is_set(name):
+    hopper, options = task_scene("hopper"), {"varied": name == "varied", "constrained": name in CONES}
+    scenes = {"hills": hopper.with_terrain(incline(10.0)), "varied": hopper, "drone": parse(DRONE)}
+    scenes |= {cone: constrained(solids(cone, 0), 1e-3) for cone in CONES}
+    text = source(scenes[name] if name in scenes else task_scene(name), **options)
+    assert text.count("wp::where(") > 3 and unset(text) == []
+
+
 CODE = {  # what the code of a feature, and of no other, does: it reads fields of the model, or calls functions
     "contact": r"\(var_m\)\.(k_n|k_d|k_t|mu|contact_\w+)\b",
     "limit": r"\(var_m\)\.(k_limit|d_limit|lower|upper)\b",
@@ -283,7 +326,7 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "drag": r"\(var_m\)\.drag_\w+\b",
     "floating": r"\bquat_(?!t\b)\w+\(",  # or a ball; every ball here is on a floating base
     "terrain": r"\(var_m\)\.(terrain|carrier_along)\b|\bnearest_of_each",
-    "varied": r"\bcontact_constants_adjoint|\blimit_constants_derivatives|\(var_m\).owned\b",
+    "varied": r"\bblocks__locals__read_\d+\(var_factors\b",
     "forced": r"\badd_forces|\(var_m\)\.body_com\b",
     "tendon": r"\(var_m\)\.tendon_\w+\b",
     "site": r"\(var_m\)\.site_\w+\b",

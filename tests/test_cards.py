@@ -6,7 +6,7 @@ import re
 
 import pytest
 from common import load_case
-from tables import origins, read_csv, unknown
+from tables import ROOT, origins, read_csv, script_of, unknown
 
 from diffsim.training import load_policy
 from tools import cards
@@ -28,7 +28,7 @@ def test_every_policy_has_a_card_that_says_where_it_comes_from() -> None:
     assert origins(cards.CARDS) and not any(map(unknown, origins(cards.CARDS)))
     for name, card in CARDS.items():
         saved = load_policy(path := FOLDER / f"{name}.pt")
-        command = f"python {saved.script}.py --env {saved.args['env']} --seed {card['seed']}"
+        command = f"python {script_of(saved.script).relative_to(ROOT)} --env {saved.args['env']} --seed {card['seed']}"
         assert card["sha256"] == cards.fingerprint(path), f"{name}: python tools/cards.py measures it"
         assert card["command"].startswith(command) and card["seed"] == str(saved.args["seed"])
         assert card["iteration"] == f"{saved.iteration} of {saved.args['iterations']}"

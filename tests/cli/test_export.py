@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,7 @@ def test_a_policy_that_tracks_takes_the_clip_as_an_input(tmp_path: Path) -> None
     env = diffsim.make("g1_track:g1_jazz_walk", 3, seed=0)
     args = parse(shac.Args, "--env g1_track:g1_jazz_walk --device cpu --actor-hidden 16".split())
     policy = shac.Actor(args, env).deterministic()
-    kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
+    kept = {name: value for name, value in dataclasses.asdict(args).items() if not isinstance(value, Path)}
     save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": kept, "iteration": 7})
     model, told = export(path, tmp_path / "policy.onnx")
     assert [each.name for each in model.graph.output] == ["action", "joint_targets"]
@@ -136,7 +137,7 @@ def test_onnx_takes_only_what_the_actor_sees(symmetric, tmp_path):
     args.symmetric = symmetric
     actor = shac.SHAC(args, env).actor
     actor.normalizer.update(3.0 + 2.0 * torch.randn(100, whole) * torch.rand(whole))
-    kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
+    kept = {name: value for name, value in dataclasses.asdict(args).items() if not isinstance(value, Path)}
     policy = actor.deterministic()[:-1]  # without tanh: actions leave [-1, 1]
     save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": kept, "iteration": 7})
     model, told = export(path, tmp_path / "policy.onnx")
