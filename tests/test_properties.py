@@ -86,7 +86,7 @@ ROWS = {
     "ant": Row(task("ant"), SEMI),
     "hopper": Row(task("hopper"), SEMI),
     "hopper, forces": Row(task("hopper"), SEMI, given=("forces",), marks=(SLOW,)),
-    "cartpole, implicit": Row(task("cartpole"), IMPLICIT),
+    "cartpole, implicit": Row(task("cartpole"), IMPLICIT, marks=(UNOPTIMIZED,)),
     "half_cheetah, implicit": Row(task("half_cheetah"), IMPLICIT, marks=(SLOW,)),
     "fluid": Row(of(small_scene, free_states, "fluid"), SEMI, marks=(SLOW,)),
     "muscles, factors": Row(
