@@ -24,7 +24,7 @@ from diffsim.robot.types import BALL_BOX, BOXES, CAPSULE_BOX, PARALLEL
 def pair_geoms(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
     """Make the functions that place contacts of two geoms, with or without what only their adjoint needs."""
     t, one, sp, block = types(spec), geom_types(spec.dtype), spatial(spec), blocks(spec)
-    T, U, vec3, mat3, Model, Links, Contacts = t.T, t.U, t.vec3, t.mat3, t.Model, t.Links, t.Contacts
+    T, U, vec3, vec4, mat3, Model, Links, Contacts = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.Links, t.Contacts
     size3, Geom, Touch, Touches = one.vec3, one.Geom, one.Touch, one.Touches
     pick, element, with_element = block.pick, block.element, block.with_element
     BLOCK, MOST = spec.block, spec.pair_sizes.most
@@ -90,6 +90,20 @@ def pair_geoms(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         return 1
 
     @wp.func
+    def clear(c: int, contacts: Contacts):
+        """Empty a contact, so that environments without it compute with finite numbers."""
+        contacts[c].active = T(0.0)
+        contacts[c].r = T(0.0)
+        contacts[c].p = vec3()
+        contacts[c].E = wp.identity(3, dtype=T)
+        if wp.static(adjoint):
+            contacts[c].how = vec4()
+        if wp.static(adjoint and MOST > 1):
+            contacts[c].z = vec3()
+            contacts[c].a = vec3()
+            contacts[c].b = vec3()
+
+    @wp.func
     def write(c: int, k: int, touch: Touch, margin: U, contacts: Contacts):
         """Write a contact to environment k of block c, all but the tangents of its frame."""
         r = touch.dist - margin
@@ -122,7 +136,7 @@ def pair_geoms(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         found = wp.zeros(shape=MOST, dtype=Touch)
         number = int(0)
         for c in range(MOST):
-            contacts[end + c].active = T(0.0)
+            clear(end + c, contacts)
         for k in range(BLOCK):
             if element(near, k) > U(0.0):
                 first = geom_at(x1, R1, m.row_size[2 * s], k)
