@@ -19,7 +19,7 @@ from diffsim.sim.options import Options
 from diffsim.sim.tangent import Tangent
 from diffsim.sim.window import Window
 
-DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # that the constraints' adjoint divides by
+DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # that MuJoCo's contact has positive
 PASSES = 30  # of Newton's method in a substep, at most, as measured in docs/physics.md
 BACKWARD_ONLY = (
     "a simulated step supports backward() and torch.autograd.grad only, for one gradient at a time: no "

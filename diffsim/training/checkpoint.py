@@ -24,7 +24,6 @@ FORMAT = 2
 POLICY = {"script", "args", "iteration", "policy"}  # what an exported policy has
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # codes of a terminal; a path may have other unprintable characters
 SHOWN = ("script", "iteration", "simulator")  # in messages, besides args
-PROVENANCE = "diffsim.training.provenance"  # of the robot
 HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one
 
 # What a policy may consist of, where it is, and the attributes that its constructor takes.

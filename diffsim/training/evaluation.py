@@ -19,7 +19,7 @@ from torch import Tensor, nn
 import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
-from diffsim.training import checkpoint, graph
+from diffsim.training import checkpoint, graph, provenance
 from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
@@ -200,7 +200,7 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
         return restored.evaluate()
 
     evaluation = measure(args)
-    pkgutil.resolve_name(checkpoint.PROVENANCE).compare(state.get("robot"), evaluation.scene)
+    provenance.compare(state.get("robot"), evaluation.scene)
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     write_evaluation(args, evaluation, state["iteration"], **compare(args, evaluation, measure))
 

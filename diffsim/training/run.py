@@ -18,13 +18,14 @@ from torch import Tensor, nn
 from diffsim.env import ActionError, DiffEnv
 from diffsim.sim.options import check_device
 from diffsim.tasks import FILE
-from diffsim.training import checkpoint, distributed, divergence, graph
+from diffsim.training import checkpoint, distributed, divergence, graph, provenance
 from diffsim.training.checkpoint import Learner
 from diffsim.training.clock import Mark
 from diffsim.training.directory import RunDirectory
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, Player, compare, make_env, write_evaluation
 from diffsim.training.flags import Flags
+from diffsim.training.fuse import fused
 from diffsim.training.log import ProgressLog, say
 from diffsim.training.recorder import TOTALS, Recorder
 from diffsim.training.signals import Signals
@@ -120,7 +121,7 @@ class Run:
             same = state["args"]["env"] == args.env or FILE.fullmatch(args.env)  # or new episodes begin
             checkpoint.restore(learner, state, (self._env, own["env"]) if self._env is not None and same else None)
             if self.writes:
-                pkgutil.resolve_name(checkpoint.PROVENANCE).compare(robot, (self._env or self.eval_env).scene)
+                provenance.compare(robot, (self._env or self.eval_env).scene)
             distributed.generator(self.device).set_state(own["rng"])
             self.iteration = state["iteration"]
             self.recorder.load_state_dict(state)
@@ -133,7 +134,7 @@ class Run:
         See graph.capture.
         """
         if self.args.compile:
-            function = pkgutil.resolve_name("diffsim.training.fuse:fused")(function, self._learner, env)
+            function = fused(function, self._learner, env)
         call = graph.capture(function, self.device, env) if self.graphs and not eager else function
 
         def timed() -> Metrics:
@@ -258,7 +259,7 @@ class Run:
         args["device"] = self.args.device if len(ranks) == 1 else self.device.type
         state = dict[str, Any](args=args, iteration=self.iteration) | self.recorder.state_dict()
         state |= dict(ranks=ranks, simulator=self.simulator, task=self.args.task_class.stored())
-        state |= dict(robot=pkgutil.resolve_name(checkpoint.PROVENANCE).fingerprint((self._env or self.eval_env).scene))
+        state |= dict(robot=provenance.fingerprint((self._env or self.eval_env).scene))
         with self.directory.writing():
             checkpoint.save(self.directory.checkpoint, self.args.script(), self._learner, state)
         self.directory.saved = self.iteration
