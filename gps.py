@@ -30,7 +30,6 @@ from diffsim.planning.lbfgs import maximise
 from diffsim.planning.policy import GaussianPolicy
 from diffsim.planning.samples import Samples, SampleSet
 from diffsim.planning.system import REAL, System
-from diffsim.tasks import find_task
 from diffsim.tasks.base import ASSETS
 from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
@@ -108,7 +107,7 @@ class Args(Flags):
     """w_r starts at their geometric mean and is changed by factors of ten between them; 0 0: no regularizer"""
 
     def task_defaults(self) -> dict[str, Any]:
-        task, own = find_task(self.env), dict[str, Any](eval_every=2, eval_episodes=100)
+        task, own = self.task_class, dict[str, Any](eval_every=2, eval_episodes=100)
         if self.task not in PER_TASK:
             return own
         own |= dict(zip(COLUMNS, PER_TASK[self.task], strict=True))
@@ -118,7 +117,7 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        task = find_task(self.env)
+        task = self.task_class
         if task.varied_by or hasattr(task, "slope"):
             fail(f"guides are of one robot on a plane, but {self.env} varies: leave its options out")
         if task.num_memory:

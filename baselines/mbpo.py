@@ -26,7 +26,6 @@ from diffsim import DiffEnv
 from diffsim.learning.ensemble import Ensemble
 from diffsim.learning.replay import ReplayBuffer, Transition
 from diffsim.planning import System
-from diffsim.tasks import find_task
 from diffsim.training import Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer, mlp
@@ -106,7 +105,7 @@ class Args(Flags):
     def check(self) -> None:
         super().check()
         first, last = self.rollout_lengths
-        rows, task = self.num_envs * (1 + self.sample_enhance), find_task(self.env)
+        rows, task = self.num_envs * (1 + self.sample_enhance), self.task_class
         jacobians = "--sample-enhance takes Jacobians of"
         most = self.iterations * self.steps - 1
         seeding = f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}: at most {most}"

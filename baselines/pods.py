@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.planning import REAL, AfterStep, Cost, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
-from diffsim.tasks import Task, find_task
+from diffsim.tasks import Task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import mlp
@@ -86,7 +86,7 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        task = find_task(self.env)
+        task = self.task_class
         if task.num_memory:
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if task.varied_by or hasattr(task, "slope"):
