@@ -47,13 +47,17 @@ ON_GPU["cartpole"] = SOME | {"critic_iterations": 16, "critic_lr": 2e-3}
 ON_GPU |= dict.fromkeys(("hopper", "humanoid", "humanoid_mtu"), MANY | {"critic_iterations": 8})
 INTEGRATION = {"ant": Integration("soft", 8, implicit=True)}  # SAPO's cheaper steps
 INTEGRATION |= dict.fromkeys(("humanoid", "humanoid_mtu"), Integration("soft", 16, implicit=True))
-# On MuJoCo's contact, whose gradients agree over few steps, with four times the environments (docs/transfer.md).
-MUJOCO = {"horizon": 8, "epochs": 2, "trust": 0.2}
-ONSET = {"half_cheetah": {"onset": (0.02, 0.005), "horizon": 16, "adjoint_clip": 3.0}}  # soft first
+# On MuJoCo's contact (docs/transfer.md): its gradients agree over few steps, with four times the environments; or
+# contacts begin softly, and PPO's loss steadies the gradient of a longer rollout.
+MUJOCO = {"epochs": 2, "trust": 0.2}
+SOFTLY = {"onset": (0.02, 0.002), "adjoint_clip": 8.0, "mix": 0.3}
+ONSET = dict.fromkeys(("half_cheetah", "humanoid", "humanoid_mtu"), SOFTLY)
 # fmt: on
 GAMMA, LAMBDA = 0.99, 0.95  # discount factor; lambda of the value estimation
 CRITIC_MINIBATCHES = 4  # of a pass over the samples of a rollout, contiguous in time
 MAX_GRAD_NORM, BETAS = 1.0, (0.7, 0.95)  # of both optimizers; Adam's decay rates of the gradient's moments
+WINDOW = 0.2, 2.0  # of the probabilities' ratio (RPO's Eq. 11)
+CLIP = 0.2  # of this ratio in PPO's loss
 FINAL_LR = 1e-5  # both learning rates reach it, linearly, after the last iteration
 ELU = partial(nn.ELU, inplace=True)
 
@@ -77,11 +81,15 @@ class Args(Flags):
     minibatches: UpTo1000 = 4
     """minibatches of such a pass, each a step of the actor on a share of the environments"""
     bound: Literal["distance", "ratio", "none"] = "distance"
-    """what ends the reuse of a sample: how far its action has moved, or how much its probability has changed"""
+    """what ends the reuse of a sample: how far its action has moved, or (the paper) how much likelier it has become"""
     trust: Positive = 0.3
-    """the bound, in standard deviations of an action, or of the probabilities' ratio from 1 (per task)"""
+    """the bound of distance, in standard deviations of an action (per task)"""
     kl_coef: NonNegative = 0.0
     """weight of the KL divergence from the policy that acted, in the loss"""
+    entropy_coef: NonNegative = 0.0
+    """weight of the policy's entropy, in the loss"""
+    mix: NonNegative = 0.0
+    """weight of PPO's clipped loss of the same samples, beside gradients scaled to its size (per task; 0: neither)"""
     critic_hidden: Widths = (128, 128)
     """units of the critic's hidden layers (per task)"""
     critic_lr: Positive = 5e-4
@@ -102,7 +110,8 @@ class Args(Flags):
         if (self.accuracy, self.contact) == ("default", "soft") and self.task in INTEGRATION:
             _, values["substeps"], values["implicit"], *_ = INTEGRATION[self.task]
         if self.contact == "mujoco":
-            values |= MUJOCO | ONSET.get(self.task, {}) | {"num_envs": 4 * values.get("num_envs", self.num_envs)}
+            few = {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
+            values |= MUJOCO | ONSET.get(self.task, few)
         return values
 
 
@@ -154,6 +163,7 @@ class Batch(NamedTuple):
     mean: Tensor  # of the policy that acted
     eps: Tensor  # standard normal noise: it took u = mean + std eps, before tanh
     gradient: Tensor  # dJ/du of the rollout's loss J
+    advantage: Tensor  # (H, B, 1), of mean 0 and deviation 1
 
 
 class RPO:
@@ -192,10 +202,15 @@ class RPO:
 
         # Several epochs on these numbers. Nothing of the simulator is needed any more.
         obs = normalizer(rollout.obs.detach())
-        metrics = self.fit_actor(Batch(obs, self.actor.mean(obs).detach(), eps, gradient), std)
+        value = td_lambda(rollout.reward.detach(), next_value.detach(), rollout.done, GAMMA, LAMBDA)
+        advantage = value.unsqueeze(-1) - self.critic(obs).detach()
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        if args.mix:  # per deviation of an action and sample, of size 1 as the advantages are
+            size = (gradient * std).square().sum(-1).mean().sqrt() * advantage.numel()
+            gradient = gradient / (size + 1e-12)
+        metrics = self.fit_actor(Batch(obs, self.actor.mean(obs).detach(), eps, gradient, advantage), std)
 
         # The critic is fitted to the TD(lambda) returns, and the target critic follows.
-        value = td_lambda(rollout.reward.detach(), next_value.detach(), rollout.done, GAMMA, LAMBDA)
         critic_loss = self.fit_critic(obs.flatten(0, 1), value.view(-1, 1))
         normalizer.update(rollout.obs)
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
@@ -214,7 +229,7 @@ class RPO:
         """Descend the surrogate in epochs of minibatches; returns metrics, each the mean of all steps.
 
         The deviation keeps its first step only, as in SHAC. Each further one would shrink the noise again along the
-        same samples, and with it the bound: learning would end early.
+        same samples, and with it the bound: learning would end early. The paper's ratio keeps all of them.
         """
         args, optimizer, metrics, once = self.args, self.actor_optimizer, list[Tensor](), list[Tensor]()
         count = min(args.minibatches, self.env.num_envs)
@@ -223,10 +238,14 @@ class RPO:
             mean, std = self.actor.mean(b.obs), self.actor.log_std.exp()
             change, beyond = surrogate(args.bound, args.trust, b, mean, std, old_std)
             kl = kl_divergence(b.mean, old_std, mean, std)
-            gradient = optimizer.gradient(count * change + args.kl_coef * kl)
+            loss = count * change + args.kl_coef * kl - args.entropy_coef * std.log().sum()
+            if args.mix:
+                loss = loss + args.mix * ppo_loss(b, mean, std, old_std)
+            gradient = optimizer.gradient(loss)
             metrics.append(torch.stack((kl.detach(), beyond, optimizer.step(gradient))))
             once = once or [self.actor.deviation.detach().clone()]
-        self.actor.deviation.detach().copy_(once[0])
+        if args.bound != "ratio":
+            self.actor.deviation.detach().copy_(once[0])
         return dict(
             zip(("losses/approx_kl", "losses/clipfrac", "grad/norm"), torch.stack(metrics).mean(0), strict=True)
         )
@@ -249,20 +268,32 @@ def surrogate(bound: str, trust: float, b: Batch, mean: Tensor, std: Tensor, old
 
     distance: an action u follows the policy, mean + std eps, and gains nothing by more than `trust` deviations; none:
     without that bound.
-    ratio: u stays, the policy passes through it with other noise, and its gradient counts pi(u|s) / pi_old(u|s) times,
-    or not at all where this ratio is off 1 by more than `trust`.
+    ratio (RPO, Eq. 10 and 11): u stays, the policy passes through it with other noise, and its gradient counts
+    pi(u|s) / pi_old(u|s) times, or not at all where this ratio has left its window.
     """
     u = b.mean + old_std * b.eps
     if bound == "ratio":
         eps = ((u - mean) / std).detach()
-        ratio = ((b.eps.square() - eps.square()) / 2 + (old_std / std.detach()).log()).sum(-1, keepdim=True).exp()
-        beyond = (ratio - 1).abs() > trust
+        ratio = probability_ratio(b, mean, std, old_std).detach()
+        beyond = (ratio < WINDOW[0]) | (ratio > WINDOW[1])
         return (ratio.masked_fill(beyond, 0.0) * b.gradient * (mean + std * eps)).sum(), beyond.to(ratio.dtype).mean()
     move, most = mean + std * b.eps - u, trust * old_std
     change, beyond = b.gradient * move, move.detach().abs() > most
     if bound == "distance":
         change = torch.maximum(change, b.gradient * move.clamp(-most, most))
     return change.sum(), beyond.to(move.dtype).mean()
+
+
+def probability_ratio(b: Batch, mean: Tensor, std: Tensor, old_std: Tensor) -> Tensor:
+    """Compute pi(u|s) / pi_old(u|s) of the actions that were taken, (H, B, 1)."""
+    eps = (b.mean + old_std * b.eps - mean) / std
+    return ((b.eps.square() - eps.square()) / 2 + (old_std / std).log()).sum(-1, keepdim=True).exp()
+
+
+def ppo_loss(b: Batch, mean: Tensor, std: Tensor, old_std: Tensor) -> Tensor:
+    """Compute PPO's clipped surrogate (Schulman et al. 2017, Eq. 7), mean over samples."""
+    ratio = probability_ratio(b, mean, std, old_std)
+    return -torch.minimum(ratio * b.advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * b.advantage).mean()
 
 
 def kl_divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:

@@ -35,8 +35,8 @@ def build(module: Any, task: str, *arguments: str) -> Any:
 def batch(samples: int = 40, actions: int = 3, dtype: torch.dtype = torch.float64) -> tuple[rpo.Batch, Tensor]:
     """Samples at random, and the deviation of the policy that took them."""
     torch.manual_seed(1)
-    obs, mean, eps, gradient = (torch.randn(samples, n, dtype=dtype) for n in (5, actions, actions, actions))
-    return rpo.Batch(obs, mean, eps, gradient), torch.rand(actions, dtype=dtype) + 0.5
+    parts = (torch.randn(samples, n, dtype=dtype) for n in (5, actions, actions, actions, 1))
+    return rpo.Batch(*parts), torch.rand(actions, dtype=dtype) + 0.5
 
 
 @pytest.mark.parametrize("module", [rpo, shac])
@@ -109,13 +109,13 @@ def test_a_sample_that_moved_far_the_right_way_moves_no_further() -> None:
 def test_the_ratio_weights_the_gradient_and_ends_it() -> None:
     """Of actions that stay where they are: the policy that passes through them has other noise."""
     b, old_std = batch()
-    mean = (b.mean + 0.2 * torch.randn_like(b.mean)).requires_grad_()
+    mean = (b.mean + 0.6 * torch.randn_like(b.mean)).requires_grad_()
     std = (1.1 * old_std).requires_grad_()
     u = b.mean + old_std * b.eps
     old, new = (Independent(Normal(m.detach(), s.detach()), 1) for m, s in ((b.mean, old_std), (mean, std)))
     ratio = (new.log_prob(u) - old.log_prob(u)).exp().unsqueeze(-1)
-    within = (ratio - 1).abs() <= 0.2
-    assert 0.1 < within.double().mean() < 0.9
+    within = (ratio >= 0.2) & (ratio <= 2.0)
+    assert (ratio < 0.2).any() and (ratio > 2.0).any() and within.double().mean() > 0.3
     change, beyond = rpo.surrogate("ratio", 0.2, b, mean, std, old_std)
     slopes = torch.autograd.grad(change, (mean, std))
     expected = ratio * within * b.gradient
@@ -131,6 +131,57 @@ def test_divergence_is_that_of_torch() -> None:
     torch.testing.assert_close(rpo.kl_divergence(b.mean, old_std, mean, std), kl_divergence(old, new).mean())
 
 
+# PPO's loss beside it -------------------------------------------------------------------------------------------------
+
+
+def test_ppos_loss_is_its_gradient_while_the_ratio_is_within_the_clip() -> None:
+    """And ends where a sample has gained enough; one that has lost as much comes back."""
+    b, old_std = batch()
+    mean = (b.mean + 0.3 * torch.randn_like(b.mean)).requires_grad_()
+    std = (1.1 * old_std).requires_grad_()
+    u = b.mean + old_std * b.eps
+    old, new = (Independent(Normal(m, s), 1) for m, s in ((b.mean, old_std), (mean, std)))
+    ratio = (new.log_prob(u) - old.log_prob(u)).exp().unsqueeze(-1)
+    ended = ((b.advantage > 0) & (ratio > 1.2)) | ((b.advantage < 0) & (ratio < 0.8))
+    assert 5 < ended.sum() < 35
+    expected = torch.autograd.grad(-(ratio * b.advantage).masked_fill(ended, 0.0).sum() / 40, (mean, std))
+    loss = rpo.ppo_loss(b, mean, std, old_std)
+    for slope, other in zip(torch.autograd.grad(loss, (mean, std)), expected, strict=True):
+        torch.testing.assert_close(slope, other)
+    torch.testing.assert_close(rpo.ppo_loss(b, b.mean, old_std, old_std), -b.advantage.mean())
+
+
+def test_gradients_and_advantages_beside_each_other_have_size_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However large the rewards are."""
+    learner, seen = build(rpo, "ant", *WIDTHS, "--mix", "0.3"), list[tuple[rpo.Batch, Tensor]]()
+    fit = learner.fit_actor
+    monkeypatch.setattr(learner, "fit_actor", lambda b, std: seen.append((b, std)) or fit(b, std))
+    learner.iterate()
+    ((b, std),) = seen
+    sizes = (b.gradient * b.gradient.shape[:2].numel() * std).square().sum(-1)
+    assert sizes.mean().item() == pytest.approx(1.0, rel=1e-4)
+    assert b.advantage.mean().abs() < 1e-5 and b.advantage.std().item() == pytest.approx(1.0, rel=1e-4)
+
+
+def test_ppos_loss_moves_the_actor_where_the_simulator_says_nothing() -> None:
+    """Without a gradient, actions that did better than expected become likelier; with weight 0 nothing moves."""
+    learner, b, old_std, _ = fitted("--epochs", "1")
+    b = b._replace(gradient=torch.zeros_like(b.gradient), advantage=b.eps.sign())
+    learner.actor_optimizer.lr.fill_(1e-3)
+    moves = []
+    for learner.args.mix in (0.0, 0.3):
+        start = learner.actor.mean(b.obs).detach()
+        learner.actor_optimizer.exp_avg.zero_(), learner.actor_optimizer.exp_avg_sq.zero_()
+        learner.fit_actor(b._replace(mean=start), learner.actor.log_std.detach().exp())
+        moves.append(((learner.actor.mean(b.obs) - start) * b.advantage).mean().item())
+    assert moves[0] == 0.0 and moves[1] > 0
+
+
+def test_entropy_widens_the_deviation() -> None:
+    wide, plain = (fitted("--bound", "ratio", "--entropy-coef", coef)[0].actor.log_std.item() for coef in ("1", "0"))
+    assert wide > plain + 0.02
+
+
 # Several epochs -------------------------------------------------------------------------------------------------------
 
 
@@ -142,7 +193,7 @@ def fitted(*arguments: str) -> tuple[Any, rpo.Batch, Tensor, dict[str, Tensor]]:
     old_std = learner.actor.log_std.detach().exp()
     with torch.no_grad():
         mean = learner.actor.mean(obs)
-    b = rpo.Batch(obs, mean, torch.randn(8, 6, 1), torch.full((8, 6, 1), 1.0))
+    b = rpo.Batch(obs, mean, torch.randn(8, 6, 1), torch.full((8, 6, 1), 1.0), torch.zeros(8, 6, 1))
     return learner, b, old_std, learner.fit_actor(b, old_std)
 
 
@@ -189,6 +240,8 @@ def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
 def test_on_mujocos_contact_rollouts_are_shorter() -> None:
     soft, firm = (parse(rpo.Args, f"--env ant --device cpu --contact {c}".split()) for c in ("soft", "mujoco"))
     assert (soft.horizon, soft.num_envs) == (32, 64) and (firm.horizon, firm.num_envs, firm.trust) == (8, 256, 0.2)
+    begun = parse(rpo.Args, "--env humanoid --device cpu --contact mujoco".split())  # softly, and PPO's loss helps
+    assert (begun.horizon, begun.num_envs, begun.onset, begun.mix) == (32, 64, (0.02, 0.002), 0.3)
 
 
 def test_minibatches_have_the_gradient_of_all_samples_on_average() -> None:
