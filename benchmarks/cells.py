@@ -97,11 +97,15 @@ class Runner:
             start = ["--resume", path]
         return self._call(case, *start, *self.args.arguments, until=until)
 
-    def evaluate(self, case: Case) -> bool:
-        """Evaluate the checkpoint, with finer steps as well, if that is not done; whether it is now."""
+    def evaluate(self, case: Case, into: str = "", *flags: object) -> bool:
+        """Evaluate the checkpoint, with finer steps as well, if that is not done; whether it is now.
+
+        Into a folder of the case's own, its seconds are not the training's.
+        """
         iteration = checkpoint.load(path := case.folder / "checkpoint.pt")["iteration"]
+        case = case._replace(folder=case.folder / into)
         done = "finer" in evaluation(case.folder, iteration)
-        return done or self._call(case, "--evaluate", path, "--run-dir", case.folder)
+        return done or self._call(case, "--evaluate", path, "--run-dir", case.folder, *flags)
 
     def _call(self, case: Case, *arguments: object, until: int = 0) -> bool:
         """Whether the script came to its end. It is stopped, and saves, when the time is up."""

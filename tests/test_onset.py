@@ -317,11 +317,46 @@ def test_what_is_retained_of_the_return_with_the_onset(monkeypatch, capsys):
     assert found["onset"] == {"metres": 0.03, "return": 200.0, "kept": 0.5}
     assert found["finer"] == {"substeps": 16, "return": 99.0, "kept": 0.99}
     assert capsys.readouterr().out.splitlines() == [
-        "16 substeps: return median 99.0, 99.0% retained",
-        "the training's last onset of 0.03 m: return median 200.0, 50.0% retained without; less than 97%: train with a "
-        "smaller --onset",
+        "16 substeps: return median 99.0, 99.0% retained in 3 episodes",
+        "the training's last onset of 0.03 m: return median 200.0, 50.0% retained without in 3 episodes; less than "
+        "97%: train with a smaller --onset",
     ]
     assert evaluation.compare(shac.Args(substeps=4), result(100.0), measure).keys() == {"finer"}
+
+
+@pytest.mark.parametrize(
+    ("own", "finer", "share", "warning"),
+    [
+        (100.0, 97.5, "97.5%", ""),
+        (100.0, 102.5, "102.5%", ""),
+        (100.0, 96.0, "96.0%", "; less than 97%"),
+        (100.0, 104.0, "104.0%", "; more than 103%"),
+        (100.0, -1.0, "-1.0%", "; less than 97%"),
+        (-100.0, -98.0, "102.0%", ""),  # costs
+        (-100.0, -110.0, "90.9%", "; less than 97%"),
+        (-100.0, -50.0, "200.0%", "; more than 103%"),
+        (-100.0, 50.0, "inf%", "; more than 103%"),
+        (0.0, 0.0, "100.0%", ""),
+        (0.0, 1.0, "inf%", "; more than 103%"),
+    ],
+)
+def test_a_return_that_gains_by_accuracy_is_told_as_one_that_loses(own, finer, share, warning, monkeypatch, capsys):
+    monkeypatch.setattr(Evaluation, "compared", True)
+
+    def result(value):
+        return Evaluation(torch.full((5,), value), *[torch.zeros(5)] * 4, None, 0.1)
+
+    def told(evaluated):
+        evaluation.compare(args, result(evaluated), lambda args, onset=0.0: result(own if onset else finer))
+        return capsys.readouterr().out.splitlines()
+
+    args = shac.Args(contact="mujoco", onset=(0.05, 0.03), substeps=4)
+    remedy = warning and f"{warning}: train with more substeps"
+    assert told(own)[0] == f"16 substeps: return median {finer:.1f}, {share} retained in 5 episodes{remedy}"
+    remedy = warning and f"{warning}: train with a smaller --onset"
+    assert told(finer)[1] == (
+        f"the training's last onset of 0.03 m: return median {own:.1f}, {share} retained without in 5 episodes{remedy}"
+    )
 
 
 def test_checkpoints_without_an_onset_load(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import pkgutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -28,7 +29,7 @@ from diffsim.training.log import say
 GAIT = "diffsim_cli.gait:report"
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # a return counts only if it survives this many times the substeps, without --implicit
-ENOUGH = 0.97  # share of the return that must survive
+ENOUGH = 0.97  # share of the return that must survive; by as much more it may not gain
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 
@@ -82,7 +83,9 @@ def kept(own: float, finer: float) -> float:
     """Share of its own return that a policy keeps with finer substeps; of costs, returns below 0, the inverse ratio."""
     if own > 0:
         return finer / own
-    return own / finer if finer < 0 else 1.0
+    if finer < 0:
+        return own / finer
+    return 1.0 if finer == own else math.inf
 
 
 class Player:
@@ -208,8 +211,9 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
 def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluation]) -> dict[str, Any]:
     """Print how much of its return a policy keeps at FINER times the substeps, without --implicit.
 
-    One that keeps less than ENOUGH has learned to exploit the integrator's errors. After training with --onset, print
-    also how much of the return with that onset is left on the file's own contact, on which policies are evaluated.
+    One that keeps less than ENOUGH has learned to exploit the integrator's errors; one that gains as much was judged on
+    other physics than it would meet. After training with --onset, print also how much of the return with that onset is
+    left on the file's own contact, on which policies are evaluated.
 
     Args:
         measure: evaluates the policy with other arguments, and options of diffsim.make.
@@ -223,18 +227,24 @@ def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluatio
     finer.substeps, finer.implicit = substeps, False
     value = measure(finer).returns.median().item()
     share = kept(own, value)
-    say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{_warning(share, 'more substeps')}")
+    over = f" in {len(evaluation.returns)} episodes"
+    say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{over}{_warning(share, 'more substeps')}")
     found = {"finer": {"substeps": substeps, "return": value, "kept": share}}
     if onset := args.onset[1]:
         value = measure(args, onset=onset).returns.median().item()
         share, name = kept(value, own), f"the training's last onset of {onset:g} m"
-        say(f"{name}: return median {value:.1f}, {share:.1%} retained without{_warning(share, 'a smaller --onset')}")
+        warning = _warning(share, "a smaller --onset")
+        say(f"{name}: return median {value:.1f}, {share:.1%} retained without{over}{warning}")
         found["onset"] = {"metres": onset, "return": value, "kept": share}
     return found
 
 
 def _warning(share: float, remedy: str) -> str:
-    return "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with {remedy}"
+    """Tell what to do about a share that is too small, or, as wrong, too large."""
+    if ENOUGH <= share <= 1 / ENOUGH:
+        return ""
+    bound = f"less than {ENOUGH:.0%}" if share < ENOUGH else f"more than {1 / ENOUGH:.0%}"
+    return f"; {bound}: train with {remedy}"
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
