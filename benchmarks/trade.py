@@ -2,6 +2,7 @@
 
     python benchmarks/trade.py                                         all trainings; what has finished is kept
     python benchmarks/trade.py --env ant --parts accuracy --seeds 1
+    python benchmarks/trade.py --time-limit 0                          judge what has been trained
     python benchmarks/trade.py --draw-only --update-results            only the figure and the tables
 
 A return holds if the same policy has it at four times the substeps, or in MuJoCo on the same file. Seconds are CPU time
@@ -11,8 +12,9 @@ that fails is a row with its message. Kernels are compiled before: a training of
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -20,10 +22,16 @@ from statistics import median
 from typing import Literal, NamedTuple
 
 from cells import Case, Runner, ScriptFlags, evaluation
-from common import LEARNT, Line, Panel, Tasks, load_case, plot, run
+from common import LEARNT, RESULTS, Line, Panel, Tasks, load_case, plot, run
+from numerics import named
 from suites import core_seconds
 from tables import Cells, Row, grouped, markdown, middle, numbers, read_csv
 from transfer import in_mujoco
+
+import rpo
+from diffsim.sim.integration import Integration
+from diffsim.tasks import find_task
+from diffsim.training.evaluation import kept
 
 PartName = Literal["accuracy", "contact", "substeps", "horizon"]
 ONCE = "--threads 1 --eval-every 0 --save-every 0 --eval-episodes 1"  # of all trainings
@@ -40,8 +48,8 @@ class Part(NamedTuple):
 HORIZONS = {h: f"--horizon {h} --num-envs {2048 // h} --iterations 200" for h in (1, 8, 32, 128, 256)}  # equal samples
 PARTS: dict[PartName, Part] = {
     "accuracy": Part(
-        {"cartpole": "rpo shac", "half_cheetah": "rpo shac", "hopper": "rpo", "ant": "rpo"},
-        {"default": "", "fast": "--accuracy fast", "accurate": "--accuracy accurate"},
+        {"cartpole": "rpo shac", "half_cheetah": "rpo shac", "hopper": "rpo", "ant": "rpo", "humanoid": "rpo"},
+        {"fast": "--accuracy fast", "default": "", "accurate": "--accuracy accurate"},
     ),
     "contact": Part(
         {"half_cheetah": "rpo", "hopper": "rpo", "ant": "rpo"},
@@ -57,6 +65,14 @@ PARTS: dict[PartName, Part] = {
         | {f"{h}, clipped": f"{flags} --adjoint-clip 5" for h, flags in HORIZONS.items()},
     ),
 }
+
+# Columns of the tables: their titles, those of the csv files and their form.
+TRADED = {"core seconds": ("core seconds", ".0f"), "return": ("return", ".0f")}
+TRADED |= {"at 4 x the substeps": ("return, finer", ".0f"), "in MuJoCo": ("return in MuJoCo", ".0f")}
+TRADED |= {"without a fall there": ("whole in MuJoCo", ".0%")}
+EXTREME = {"core seconds": "core seconds", "return": "return", "at 4 x the substeps": "return, finer"}
+EXTREME |= {"contained": "contained"}
+ERRORS = {"state error (m, rad)": "state 0.5 s", "gradient error": "gradient 32", "cosine": "cosine 32"}
 
 
 @dataclass
@@ -104,52 +120,110 @@ def measure(runner: Runner, case: Case) -> dict[str, object]:
     }
 
 
-def retained(rows: list[Cells]) -> list[Row]:
-    """A line for each setting of a part, medians of its seeds. Those of the front are bold: no other one of the task is
-    both faster and better in the return that holds."""
-    lines = list[Row]()
-    for (task,), own in grouped(rows, "task").items():
-        settings = {name: each for (name,), each in grouped(own, "setting").items()}
-        points = {name: (cost(each), holds(each)) for name, each in settings.items() if numbers(each, "return, finer")}
-        for name, each in settings.items():
-            here = points.get(name)
-            best = here and not any(x < here[0] and y >= here[1] for x, y in points.values())
-            line = {"task": task, "setting": f"**{name}**" if best else name}
-            line |= {"core seconds": middle(each, "core seconds", ".0f"), "return": middle(each, "return", ".0f")}
-            line |= {"return, finer": middle(each, "return, finer", ".0f")}
-            line |= {"in MuJoCo": middle(each, "return in MuJoCo", ".0f")}
-            lines.append(line | {"without a fall there": middle(each, "whole in MuJoCo", ".0%")})
-    return lines
+def defaults(directory: Path, tasks: Sequence[str]) -> list[Cells]:
+    """RPO's trainings at the default on a GPU, of cells.csv."""
+    rows = [row for row in read_csv(directory / "cells.csv") if row["learner"] == "rpo" and row["task"] in tasks]
+    for row in rows:
+        own, kept = float(row["return"]), float(row["kept"])
+        row |= {"part": "accuracy", "setting": "default", "return, finer": str(own * kept if own > 0 else own / kept)}
+    return rows
 
 
-def cost(rows: list[Cells]) -> float:
-    return median(numbers(rows, "core seconds"))
+# Tables and the figure ------------------------------------------------------------------------------------------------
+
+
+def seconds(rows: list[Cells]) -> float:
+    return median(numbers(rows, "core seconds") or [math.nan])
 
 
 def holds(rows: list[Cells]) -> float:
     return median(numbers(rows, "return, finer"))
 
 
-def told(rows: list[Cells]) -> list[Row]:
-    """A line for each setting of an extreme: its returns, what was contained, and what a failure printed."""
+def front(points: Mapping[str, tuple[float, float]]) -> set[str]:
+    """Those seconds and returns to which none of less seconds has a return as high."""
+    return {name for name, (x, y) in points.items() if not any(a < x and b >= y for a, b in points.values())}
+
+
+def traded(rows: list[Cells]) -> list[Row]:
+    """A line for each task and setting, medians of its seeds; settings of the front are bold."""
+    lines = list[Row]()
+    for (task,), own in grouped(rows, "task").items():
+        settings = {name: each for (name,), each in grouped(own, "setting").items()}
+        best = front({name: (seconds(each), holds(each)) for name, each in settings.items()})
+        for name, each in settings.items():
+            line = {"task": task, "setting": f"**{name}**" if name in best and seconds(each) > 0 else name}
+            for title, (column, form) in TRADED.items():
+                line |= {title: middle(each, column, form)} if numbers(rows, column) else {}
+            lines.append(line)
+    return lines
+
+
+def extreme(rows: list[Cells]) -> list[Row]:
+    """A line for each training: its returns, states and gradients that were contained, and what a failure printed."""
     lines = list[Row]()
     for row in rows:
-        line = {"task": row["task"], row["part"]: row["setting"]}
-        line |= {name: middle([row], name, ".0f") for name in ("core seconds", "return", "return, finer", "contained")}
-        lines.append(line | {"failed": row["failed"]})
+        line: Row = {"task": row["task"], row["part"]: row["setting"]}
+        line = {**line, **{title: middle([row], column, ".0f") for title, column in EXTREME.items()}}
+        lines.append({**line, "failed": row["failed"]})
+    return lines
+
+
+def integration(row: Cells) -> Integration:
+    """How RPO's training of a row on penalty contact was integrated."""
+    presets = find_task(row["task"]).presets()
+    if row["part"] == "substeps":
+        return presets["default"]._replace(substeps=int(row["setting"]))
+    return (row["setting"] == "default" and rpo.INTEGRATION.get(row["task"])) or presets[row["setting"]]
+
+
+def learned(rows: list[Cells]) -> list[Cells]:
+    """A line for each task and way of integration: its errors, and the return of RPO that holds."""
+    errors = {(row["task"], row["setting"]): row for row in read_csv(RESULTS / "cpu" / "numerics_presets.csv")}
+    rows = [row for row in rows if row["part"] in ("accuracy", "substeps") and "shac" not in row["setting"]]
+    lines = list[Cells]()
+    for (task,), own in grouped((row for row in rows if row["return, finer"]), "task").items():
+        found = {integration(each[0]): each for each in grouped(own, "part", "setting").values()}
+        best = max(map(holds, found.values()))
+        for how, each in sorted(found.items(), key=lambda item: item[0].substeps):
+            error = errors[task, named(how)]
+            line = {"task": task, "substeps": f"{how.substeps}{' implicit' * how.implicit}"}
+            line |= {"core seconds": middle(each, "core seconds", ".0f")}
+            line |= {title: error[column] for title, column in ERRORS.items()}
+            lines.append(line | {"share of the best return": f"{kept(best, holds(each)):.2f}"})
     return lines
 
 
 def panels(rows: list[Cells]) -> Iterator[Panel]:
-    """Seconds against the return that holds, of each task: medians as points, all seeds as a line."""
-    styles = {name: f"C{k}" for k, name in enumerate(dict.fromkeys(row["setting"].split(", ")[-1] for row in rows))}
+    """Seconds against the return that holds, of each task: all seeds as a line, their median as a point."""
+    styles = {name: f"C{k}" for k, name in enumerate(PARTS["accuracy"].settings)}
     for (task,), own in grouped(rows, "task").items():
-        lines = list[Line]()
-        for (name,), each in grouped([row for row in own if row["return, finer"]], "setting").items():
-            x, y, style = cost(each), numbers(each, "return, finer"), styles[name.split(", ")[-1]]
-            marker = "s" if name.startswith("shac") else "o"
-            lines += [Line([x, x], [min(y), max(y)], f"{style}-"), Line([x], [holds(each)], f"{style}{marker}", name)]
-        yield Panel(lines, task, "core seconds of training", "return at 4 x the substeps", "x")
+        lines, points = list[Line](), dict[str, tuple[float, float]]()
+        for (name,), each in grouped(own, "setting").items():
+            learner, _, setting = name.rpartition(", ")
+            colour, label = styles[setting], f"{learner or 'rpo'}, {setting}"
+            points[name] = x, middle = seconds(each), holds(each)
+            y = numbers(each, "return, finer")
+            lines.append(Line([x, x], [min(y), max(y)], f"{colour}-"))
+            lines.append(Line([x], [middle], f"{colour}{'s' if learner else 'o'}", label))
+        best = sorted(points[name] for name in front(points))
+        through = Line([x for x, _ in best], [y for _, y in best], "k:", "front", 0.8)
+        yield Panel([through, *lines], task, "core seconds of training", "return at 4 x the substeps", "x")
+
+
+def gradient_panel(rows: list[Cells]) -> Panel:
+    """The error of the gradient against the return that holds, a line for each task."""
+    lines = list[Line]()
+    for k, ((task,), own) in enumerate(grouped(learned(rows), "task").items()):
+        x, y = numbers(own, "gradient error"), numbers(own, "share of the best return")
+        lines.append(Line(x, y, f"C{k + 3}o-", task, 0.8))
+    return Panel(lines, "all tasks", "error of the gradient over 32 steps", "share of the best return", "x")
+
+
+def place(row: Cells) -> tuple[int, bool, int]:
+    """Order rows by task, learner and setting."""
+    setting, known = row["setting"].removeprefix("shac, "), {str(part): [*PARTS[part].settings] for part in PARTS}
+    return LEARNT.index(row["task"]), setting != row["setting"], known[row["part"]].index(setting)
 
 
 def main(args: Args) -> None:
@@ -158,12 +232,17 @@ def main(args: Args) -> None:
         if all(any(str(about[name]) != row[name] for name in KEY) for row in args.read("trade")):
             if found := measure(runner, case):
                 args.keep("trade", about | found, KEY)
-    rows = sorted(args.read("trade"), key=lambda row: LEARNT.index(row["task"]))
+    rows = args.read("trade")
+    rows += defaults(args.directory, [row["task"] for row in rows]) if args.directory.name != "cpu" else []
+    rows.sort(key=place)
     for part in PARTS:
-        own = [row for row in rows if row["part"] == part]
-        shown = retained(own) if part in ("accuracy", "contact") else told(own)
-        args.publish(f"trade {part}", markdown(shown), PAGE)
-    plot(args.picture("trade"), [[*panels([row for row in rows if row["part"] == "accuracy"])]], (3.2, 2.8))
+        if own := [row for row in rows if row["part"] == part]:
+            shown = traded(own) if part in ("accuracy", "contact") else extreme(own)
+            args.publish(f"trade {part}", markdown(shown), PAGE)
+    if args.directory.name == "cpu":
+        args.publish("trade gradients", markdown(learned(rows)), PAGE)
+        accuracy = [row for row in rows if row["part"] == "accuracy"]
+        plot(args.picture("trade"), [[*panels(accuracy), gradient_panel(rows)]], (3.2, 2.8))
 
 
 if __name__ == "__main__":
