@@ -89,11 +89,12 @@ def cases(args: Args) -> Iterator[tuple[dict[str, object], Case]]:
     """What a row of the csv file is of, and its training."""
     for seed, part, task in product(args.seeds, args.parts, args.env):
         scripts, settings = PARTS[part].tasks.get(task, "").split(), PARTS[part].settings
-        for setting, script in product([name for name in settings if name in (args.settings or settings)], scripts):
+        for script, setting in product(scripts, settings):
             name = setting if script == "rpo" else f"{script}, {setting}"
-            folder = args.runs / part / re.sub(r"\W+", "_", f"{task}__{name}") / str(seed)
-            about = {"part": part, "task": task, "setting": name, "seed": seed}
-            yield about, Case(folder, task, seed, script, (*ONCE.split(), *settings[setting].split()))
+            if name in (args.settings or (name,)):
+                folder = args.runs / part / re.sub(r"\W+", "_", f"{task}__{name}") / str(seed)
+                about = {"part": part, "task": task, "setting": name, "seed": seed}
+                yield about, Case(folder, task, seed, script, (*ONCE.split(), *settings[setting].split()))
 
 
 def measure(runner: Runner, case: Case) -> dict[str, object]:
