@@ -10,7 +10,8 @@ which see jumps that no derivative sees. All begin in one state, with its comman
 differences agree among themselves bounds that: by two sizes of the shift, and between two halves of the environments.
 The standard error of what they differ by, relative to the differences, tells how much other environments would change.
 In float64, tiny differences of single environments, which meet no jump, tell whether the derivative itself is right.
-The contacts are the paper's springs, without the robots that have dry friction, and MuJoCo's own. Writes gradients.csv.
+The contacts are the paper's springs, without the robots that have dry friction, MuJoCo's own, and MuJoCo's that begin
+over 20 mm. Writes gradients.csv.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ from diffsim.training.evaluation import SEED
 GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "soft": {"contact": "soft"},
     "mujoco": {"contact": "mujoco"},
+    "onset 20 mm": {"contact": "mujoco", "onset": 0.02},
 }
-ROLLOUTS = 4, 8, 16  # control steps
+ROLLOUTS = 4, 8, 16, 32  # control steps
 TINY, FEW = 1e-6, 32  # the shift in float64, and of how many environments at most
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
 AGREE, CHANCE = 0.9, 0.5  # the page shows cosines where differences by SHIFT and by half of it agree better than by
@@ -49,6 +51,7 @@ Policy = Callable[[Tensor], Tensor | float]
 class Args(common.CheckpointFlags):
     num_envs: Count = 1024  # environments
     horizons: tuple[Count, ...] = ROLLOUTS  # control steps of a rollout
+    grounds: tuple[str, ...] = tuple(GROUNDS)  # contacts
     directions: Count = 12  # of the shift, at most: random ones where there are more controls
     warmup: Count = 150  # control steps before the rollout
 
@@ -130,8 +133,13 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     if task not in diffsim.TASKS:
         case = common.load_case(path, 1, "cpu")
         task, learner, policy = case.env.task.name, case.saved.script, case.saved.network
-    for ground, contact in GROUNDS.items():
-        options = contact | {"horizon": max(args.horizons), "early_termination": False, "max_episode_steps": 10**9}
+    for ground in args.grounds:
+        options: dict[str, Any] = {
+            "horizon": max(args.horizons),
+            "early_termination": False,
+            "max_episode_steps": 10**9,
+        }
+        options |= GROUNDS[ground]
         try:
             env = diffsim.make(task, n, **options)  # in which no episode ends: a reset within a rollout is no slope
             exact = diffsim.make(task, min(n, FEW), **options, dtype=torch.float64, tolerance=1e-10)
@@ -156,22 +164,23 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each policy on MuJoCo's contact; no cosine that chance decides, or of differences that disagree."""
+    """A line for each policy on each of MuJoCo's; no cosine that chance decides, or of differences that disagree."""
     lines = list[Row]()
-    hard = [row for row in rows if row["ground"] == "mujoco"]
-    for (task, learner), own in grouped(hard, "task", "learner").items():
+    hard = [row for row in rows if row["ground"] != "soft"]
+    for (task, learner, ground), own in grouped(hard, "task", "learner", "ground").items():
         sure = [row for row in own if float(row["differences"]) > AGREE and float(row.get("chance") or 0) < CHANCE]
         if not sure:
             continue
         cosines = {int(row["horizon"]): row["cosine"] for row in sure}
         ratios = {int(row["horizon"]): row.get("ratio", "") for row in sure}
         line = {f"cosine, {k} steps": cosines.get(k, "") for k in ROLLOUTS}
-        name = task if learner == "noise" else f"{task}, {learner}"
+        name = ", ".join((task, *(x for x in (learner, ground) if x not in ("noise", "mujoco"))))
         lines.append({"task": name} | line | {"ratio, 8 steps": ratios.get(8, "")})
     return lines
 
 
 def main(args: Args) -> None:
+    common.check_names("--grounds", args.grounds, GROUNDS)
     measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
 
 
