@@ -23,13 +23,16 @@ from pathlib import Path
 from typing import Any
 
 import common
+import mujoco
+import numpy as np
 import torch
 from common import Part, measured, run
-from tables import Row, grouped
+from tables import Row, grouped, numbers
 from torch import Tensor
 
 import diffsim
 from diffsim import DiffEnv, SceneError
+from diffsim.robot.constants import soften
 from diffsim.training import Count
 from diffsim.training.evaluation import SEED
 
@@ -179,9 +182,46 @@ def shown(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
+BALL = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+<body pos="0 0 0.1"><freejoint/><geom type="sphere" size="0.1" mass="1"/></body></worldbody></mujoco>"""
+
+
+def force(heights: np.ndarray, onset: float) -> list[float]:
+    """MuJoCo's force on a ball of 1 kg at rest [N], its lowest point at `heights` [m], by an onset [m]."""
+    model = mujoco.MjModel.from_xml_string(BALL)
+    model.geom_solimp[:] = [soften(row, onset) for row in model.geom_solimp]
+    data, found = mujoco.MjData(model), []
+    for height in heights:
+        data.qpos[2] = 0.1 + height
+        mujoco.mj_forward(model, data)
+        found.append(float(data.qfrc_constraint[2]))
+    return found
+
+
+def panels(rows: list[dict[str, str]]) -> list[common.Panel]:
+    """What a soft onset does to the force, and to the gradients of rollouts."""
+    height = np.linspace(0.002, -0.02, 221)
+    looks = {"C3-": 0.0, "C1-": 0.005, "C0-": 0.02}
+    balls = [
+        common.Line(1e3 * height, force(height, m), look, f"{1e3 * m:g} mm" if m else "the file's default")
+        for look, m in looks.items()
+    ]
+    found = [common.Panel(balls, "", "lowest point of a ball [mm]", "force [N]")]
+    for (task,), own in grouped([row for row in rows if row["learner"] == "noise"], "task").items():
+        if any(row["ground"] == "onset 20 mm" for row in own):
+            drawn = [(look, [row for row in own if row["ground"] == name]) for look, name in LOOKS]
+            curves = [common.Line(numbers(some, "horizon"), numbers(some, "cosine"), look) for look, some in drawn]
+            found.append(common.Panel(curves, task, "steps of a rollout", "cosine with differences"))
+    return found
+
+
+LOOKS = ("C3o-", "mujoco"), ("C0o-", "onset 20 mm")
+
+
 def main(args: Args) -> None:
     common.check_names("--grounds", args.grounds, GROUNDS)
-    measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
+    rows = measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
+    common.plot(args.picture("onset"), [panels(rows)], (3.4, 2.6))
 
 
 if __name__ == "__main__":
