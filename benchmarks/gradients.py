@@ -217,8 +217,6 @@ def panels(rows: list[dict[str, str]]) -> list[common.Panel]:
     return found
 
 
-
-
 def main(args: Args) -> None:
     common.check_names("--grounds", args.grounds, GROUNDS)
     rows = measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
