@@ -96,7 +96,7 @@ def test_tree_gradient_is_that_of_differences(base, rng):
 
 # A crank and a rocker, whose coupler closes the loop at sites, and a gripper whose fingers mirror each other.
 FOUR_BAR = """
-<mujoco> <option timestep="0.002"/>
+<mujoco> <option timestep="0.002"/> <default> <geom contype="0" conaffinity="0"/> </default>
   <worldbody>
     <body name="crank"> <joint name="crank" axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 0 0 .1" size=".01"/>
       <body pos="0 0 .1"> <joint axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 .3 0 .05" size=".01"/>
@@ -403,10 +403,49 @@ def test_fixed_shapes_that_would_overlap_at_the_start_are_left_out():
         f'<body pos=".45 .45 {z}"> <joint type="slide"/> <geom name="ball {z}" size=".05"/> </body>' for z in (0, 1)
     )
     scene = parse(robot(f'{balls} <geom name="table" type="cylinder" size=".5 .02"/>', "", ""))
-    (first, second), (pair,) = (scene.mj_model.geom(f"ball {z}").id for z in (0, 1)), scene.geom_pairs
-    assert second in pair and first not in pair
+    first, second, table = (scene.mj_model.geom(name).id for name in ("ball 0", "ball 1", "table"))
+    assert {frozenset(pair) for pair in scene.geom_pairs} == {frozenset((first, second)), frozenset((second, table))}
     sentence = "Left out, because such shapes overlap at the start: contact of the geoms 'table' and 'ball 0'."
     assert sentence in approximations(scene)
+
+
+# A hand of two links on a table with a drawer, a door in a frame, and a second hand
+KITCHEN = """
+<mujoco> <default> <geom density="100"/> </default> <worldbody>
+  <body name="table"> <geom name="top" type="box" size=".3 .3 .02" pos="0 0 -.05"/>
+    <body name="hand"> <joint type="slide" axis="0 1 0"/> <joint type="slide" axis="1 0 0"/> <geom name="palm" size=".1"/>
+      <body name="finger"> <joint axis="0 0 1"/> <geom name="finger" type="capsule" fromto="0 0 0 .3 0 0" size=".04"/>
+        <body name="tip" pos=".3 0 0"> <joint axis="0 0 1"/> <geom name="tip" size=".05"/> </body> </body> </body>
+    <body name="drawer" pos="0 .3 .1"> <joint type="slide" axis="0 1 0" damping="2"/>
+      <geom name="drawer" type="box" size=".2 .02 .1"/> </body> </body>
+  <body name="frame" pos=".5 .3 0"> <geom name="frame" size=".03"/>
+    <body name="leaf"> <joint axis="0 0 1" damping=".2"/> <geom name="leaf" type="box" size=".1 .02 .3" pos="-.1 0 0"/> </body> </body>
+  <body name="other" pos=".1 -.2 0"> <joint type="slide" axis="0 1 0"/> <geom name="other" size=".08"/> </body>
+  </worldbody> <contact> <exclude body1="drawer" body2="other"/> </contact> </mujoco>"""
+
+
+def test_doors_drawers_and_second_arms_touch_as_in_mujoco(rng):
+    """Without `with_pairs`; a robot's own parts, of one tree with its fixed base, do not."""
+    scene = parse(KITCHEN)
+    m, bodies = scene.mj_model, ("hand", "finger", "tip")
+    found = {frozenset(m.geom(geom).name for geom in pair) for pair in scene.geom_pairs}
+    hand, rest = ("palm", "finger", "tip"), ("drawer", "leaf", "other", "frame")
+    expected = {frozenset(pair) for pair in product(hand, rest)} | {
+        frozenset(pair)
+        for pair in [("drawer", "leaf"), ("drawer", "frame"), ("leaf", "other"), ("frame", "other")]
+        + [("top", "leaf"), ("top", "other")]
+    }
+    assert found == expected
+    spec, n = mujoco.MjSpec.from_string(KITCHEN), 48
+    for part, base in [("tip", "hand"), *product((*bodies, "drawer"), ["table"]), ("leaf", "frame")]:
+        spec.add_exclude(bodyname1=part, bodyname2=base)
+    own = model_as_it_is(parse(spec.to_xml()))
+    qpos, qvel = 0.1 * rng.normal(size=(n, scene.nq)), 0.3 * rng.normal(size=(n, scene.nv))
+    states = qpos, qvel, np.zeros((n, 0))
+    expected, found = in_mujoco(scene, *states, model=own)[1], step(scene, states)[1]
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+    alone = step(dataclasses.replace(scene, geom_pairs=()), states)[1]
+    assert (abs(found - alone).max(1) > 1e-3).sum() > n / 2
 
 
 def apart_from_itself(scene):

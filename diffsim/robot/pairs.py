@@ -12,7 +12,7 @@ import numpy as np
 from diffsim.robot.contacts import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
 from diffsim.robot.scene import Scene
-from diffsim.robot.shapes import as_primitives, is_exact, obstacle_geoms
+from diffsim.robot.shapes import as_primitives, is_exact
 from diffsim.robot.types import (
     BALL_BOX,
     BOXES,
@@ -158,14 +158,17 @@ def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
     return found
 
 
-def obstacle_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
-    """List the pairs with such a geom."""
-    fixed = obstacle_geoms(m)
-    return [pair for pair in self_pairs(m) if fixed[list(pair)].any()]
+def default_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
+    """List the pairs that touch without with_pairs, see load_scene."""
+    pairs, body = np.array(self_pairs(m), int).reshape(-1, 2), m.geom_bodyid
+    tree, root = m.body_treeid[body[pairs]], m.body_rootid[body[pairs]]
+    own = (tree[:, 0] == tree[:, 1]) | ((tree.min(1) < 0) & (root[:, 0] == root[:, 1]))  # or of the tree's fixed base
+    free = m.ntree > 1 and (m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
+    return [(a, b) for a, b in pairs[free | ~own].tolist()]
 
 
 def with_pairs(scene: Scene) -> Scene:
-    """Return a copy whose parts touch each other and fixed geoms as the file lets them, on MuJoCo's contact.
+    """Return a copy in which a robot's own parts touch each other, too, as the file lets them, on MuJoCo's contact.
 
     Example:
         from diffsim.robot.pairs import with_pairs
@@ -180,9 +183,9 @@ def with_pairs(scene: Scene) -> Scene:
     return _with(scene, self_pairs(scene.mj_model))
 
 
-def with_obstacles(scene: Scene) -> Scene:
-    """Return a copy whose parts touch fixed geoms beside the ground, and not each other; itself without such geoms."""
-    pairs = obstacle_pairs(scene.mj_model)
+def with_defaults(scene: Scene) -> Scene:
+    """Return a copy whose pairs are the default ones; itself without any."""
+    pairs = default_pairs(scene.mj_model)
     return _with(scene, pairs) if pairs else scene
 
 
