@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
+from diffsim.robot import types
 from diffsim.robot.contacts import (
     HULL_POINTS,
     base_geoms,
@@ -17,7 +18,7 @@ from diffsim.robot.contacts import (
     pair_law,
 )
 from diffsim.robot.elements import control_range, label, listed, motors, muscles
-from diffsim.robot.pairs import self_pairs
+from diffsim.robot.pairs import first_contacts, self_pairs
 from diffsim.robot.scene import Scene
 from diffsim.robot.shapes import as_primitives, deviation, directions, is_exact, obstacle_geoms, reach
 from diffsim.tasks.own_task import start_control
@@ -94,6 +95,8 @@ def _self_contact(scene: Scene) -> Iterator[str]:
         words = ["surfaces differ by up to ", *[""] * len(rough)]
         told = [f"{names[k]} as a {shapes[k]} ({words[k]}{off[geom]:.3g} mm)" for k, geom in enumerate(rough)]
         yield f"Fixed geoms touch others as simpler shapes: {listed(told)}."
+    if (number := first_contacts(scene)) > types.MOST_ROOM:
+        yield f"Of the {number} contacts between bodies at the start only the {types.MOST_ROOM} deepest act."
     there = set(scene.geom_pairs)
     missing = [pair for pair in self_pairs(m) if pair not in there]
     if gone := [pair for pair in missing if fixed[list(pair)].any()]:

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from diffsim.robot import types
 from diffsim.robot.contacts import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
 from diffsim.robot.scene import Scene
@@ -22,6 +23,7 @@ from diffsim.robot.types import (
     JOINT,
     PARALLEL,
     POINT,
+    ROOM_OF_TREE,
     SEGMENTS,
     TURN,
     Array,
@@ -225,6 +227,21 @@ def touching_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
 def touching(data: mujoco.MjData) -> set[tuple[int, int]]:
     """Return the pairs of geoms of MuJoCo's contacts, the lower one first."""
     return {(min(a, b), max(a, b)) for a, b in data.contact.geom.tolist()}
+
+
+def first_contacts(scene: Scene) -> int:
+    """Count the contacts of pairs in the reference pose or the keyframe that has most of them."""
+    pairs, most = set(scene.geom_pairs), 0
+    for data in first_poses(as_primitives(scene.mj_model)) if pairs else ():
+        mujoco.mj_collision(data.model, data)
+        most = max(most, sum((min(a, b), max(a, b)) in pairs for a, b in data.contact.geom.tolist()))
+    return most
+
+
+def room_of(scene: Scene) -> int:
+    """Return the room for contacts of pairs at once: more for many bodies, or if there are many at first."""
+    wanted = max(ROOM_OF_TREE * scene.mj_model.ntree, 2 * first_contacts(scene))
+    return min(max(types.LEAST_ROOM, wanted), types.MOST_ROOM)
 
 
 def rows_of(scene: Scene, row: Row, touch: Touch) -> Pairs | None:

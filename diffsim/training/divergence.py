@@ -40,10 +40,10 @@ def reward_has_gradient(env: DiffEnv) -> bool:
     def draw(like: torch.Tensor) -> torch.Tensor:
         return torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
 
-    state = [(x.detach() + 0.05 * draw(x)).requires_grad_() for x in (env.qpos, env.qvel)]
+    qpos, qvel = ((x.detach() + 0.05 * draw(x)).requires_grad_() for x in (env.qpos, env.qvel))
     action = (0.3 * draw(env.qpos.new_zeros(env.num_envs, env.scene.nu))).clamp(-1.0, 1.0)
-    reward = env.task.reward(env.observe(*state, action), action)
+    reward = env.task.reward(env.observe(qpos, qvel, action), action)
     if not reward.requires_grad:
         return False
-    slopes = torch.autograd.grad(reward.sum(), state, allow_unused=True)
+    slopes = torch.autograd.grad(reward.sum(), (qpos, qvel), allow_unused=True)
     return any(slope is not None and bool(slope.any()) for slope in slopes)
