@@ -60,6 +60,10 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     if left_out := [] if isinstance(path, mujoco.MjModel) else strays(model):
         spec = path.copy() if isinstance(path, mujoco.MjSpec) else mujoco.MjSpec.from_file(str(file))
         for body in left_out:
+            gone = {spec.body(body), *spec.body(body).find_all("body")}
+            gone_names = {each.name for each in gone}
+            for looking in (*spec.cameras, *spec.lights):  # which only draw, and would miss what they look at
+                looking.targetbody = "" if looking.targetbody in gone_names else looking.targetbody
             spec.delete(spec.body(body))  # with its joints, their actuators and numbers of keyframes
         model = spec.compile()
     _obey_flags(model)
