@@ -229,6 +229,25 @@ def test_onnx_without_a_display_is_one_line(arguments: list[str], hint: str, tmp
     assert found.returncode == 2 and hint in found.stderr.splitlines()[-1] and not list(tmp_path.glob("*.mp4"))
 
 
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ("", "no such file: policy.onnx; write one by python -m diffsim export CHECKPOINT policy.onnx"),
+        (
+            "hopper",
+            "a policy of hopper, which follows no commands as those of go1, go2 and g1; examples/own_quadruped.py",
+        ),
+    ],
+)
+def test_onnx_that_cannot_be_walked_is_one_line(policy: str, message: str, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    if policy:
+        main(["export", str(POLICIES / f"{policy}.pt"), str(tmp_path / "policy.onnx")])
+    command = [sys.executable, ROOT / "examples" / "run_onnx.py", "policy.onnx"]
+    found = subprocess.run(command, env=os.environ | PATH, cwd=tmp_path, capture_output=True, text=True)
+    assert found.returncode == 2 and message in found.stderr.splitlines()[-1]
+
+
 @pytest.mark.parametrize("name, file", [("go2", "go2.xml"), ("go2", "motors.xml"), ("g1", "g1.xml")])
 def test_onnx_acts_and_walks_as_the_policy_is_judged(name: str, file: str, tmp_path: Path) -> None:
     """Beside benchmarks/joystick.py's world for 2 s; with motors in another order, too."""

@@ -72,7 +72,10 @@ class SavedPolicy:
         """
         trained = self.args["env"]
         if (own := FILE.fullmatch(trained)) and given is None:
-            fail(f"a policy of your own task: give its file, whose code runs, by --env {trained} (drive: as robot)")
+            fail(
+                f"a policy of your own task, whose code runs only if you name its file: add --env {trained}, or give "
+                "drive the file in place of the robot"
+            )
         if given is not None and not own and base_name(given) in {*TASKS} - {base_name(trained)}:
             fail(f"a policy that was trained on {trained}, not on {given}")
         return given or trained
