@@ -10,6 +10,7 @@ import pytest
 import torch
 from random_scenes import RandomScene
 
+from diffsim.robot.constants import constrained
 from diffsim.robot.elements import control_range
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.pairs import with_pairs
@@ -45,6 +46,7 @@ def load(text: str) -> tuple[Scene | None, str]:
         scene = load_scene(mujoco.MjSpec.from_string(text))
         if any(line.startswith("The robot's parts") for line in approximations(scene)):
             scene = with_pairs(scene)
+        constrained(scene, scene.mj_model.opt.timestep, single=False)
         told = [line for line in approximations(scene) if not line.startswith(HARMLESS)]
         return (None, f"approximated: {told[0]}") if told else (scene, "")
     except SceneError as error:
