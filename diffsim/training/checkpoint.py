@@ -127,8 +127,9 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
         form = state["format"]
         whole = whole and (form != FORMAT or state.keys() >= POLICY)
         if whole and form == FORMAT:
+            whole = isinstance(state["script"], str) and isinstance(state["args"]["env"], str)
             shown = *state["args"], *state["args"].values(), *(state.get(name) for name in SHOWN)
-            whole = not any(CONTROL.search(str(text)) for text in shown)
+            whole &= not any(CONTROL.search(str(text)) for text in shown)
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         whole = False
     if not whole:
