@@ -243,9 +243,9 @@ class _Robot:
                 raise ValueError(f"{name}[{', '.join(map(str, place))}] is {found[place].item()}, must {rule}")
         simple = torch.tensor(self.m.body_simple != 0)[:, None]
         if name == "com" and bool((fixed := simple & (found != file)).any()):
-            body = label(self.m, mujoco.mjtObj.mjOBJ_BODY, int(fixed.nonzero()[0, 0]))
+            which = label(self.m, mujoco.mjtObj.mjOBJ_BODY, int(fixed.nonzero()[0, 0]))
             raise ValueError(
-                f'com of body {body} is its origin to MuJoCo, which simplifies: write <body simple="false">'
+                f'com of body {which} is its origin to MuJoCo, which simplifies: write <body simple="false">'
             )
         if name == "inertia" and bool((wrong := 2 * found.amax(1) > (1 + 1e-6) * found.sum(1)).any()):
             body = int(wrong.nonzero()[0])

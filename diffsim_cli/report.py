@@ -62,8 +62,8 @@ def _parts(scene: Scene) -> Iterator[str]:
     yield f"mass       {scene.mass.sum():.4g} kg"
     servo, motor = servos(m) & ~muscles(m), motors(m) & ~muscles(m)
     position = servo & (m.actuator_biasprm[:, 1] != 0)
-    counts = {"motors": motor, "position servos": position, "velocity servos": servo & ~position}
-    found = [f"{n} {kind}" for kind, which in counts.items() if (n := np.count_nonzero(which))]
+    drives = {"motors": motor, "position servos": position, "velocity servos": servo & ~position}
+    found = [f"{n} {kind}" for kind, which in drives.items() if (n := np.count_nonzero(which))]
     yield f"controls   {', '.join(found + [f'{pulling} muscles'] * bool(pulling)) or 'none'}"
     wrong = "" if 0 < m.opt.timestep < np.inf else ", with which MuJoCo cannot step"
     yield f"timestep   {1e3 * m.opt.timestep:g} ms in the file{wrong}; in a task control_dt / substeps"
