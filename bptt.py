@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -44,6 +44,8 @@ FINAL_LR = 1e-5  # the learning rate reaches it, linearly, after the last iterat
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
+
+    differentiates: ClassVar[bool] = True
 
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""

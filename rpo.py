@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -65,6 +65,8 @@ ELU = partial(nn.ELU, inplace=True)
 @dataclass
 class Args(Flags):
     """The algorithm. With --epochs 1 --minibatches 1 an iteration is SHAC's."""
+
+    differentiates: ClassVar[bool] = True
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""

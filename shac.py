@@ -14,7 +14,7 @@ import copy
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -47,6 +47,8 @@ ELU = partial(nn.ELU, inplace=True)
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
+
+    differentiates: ClassVar[bool] = True
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""

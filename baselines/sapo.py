@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -65,6 +65,8 @@ SELECTION = 0.5  # share of the iterations after which the best policy continues
 @dataclass
 class Args(Flags):
     """The algorithm. With --no-entropy --no-state-std --critics 1 --activation elu it is SHAC."""
+
+    differentiates: ClassVar[bool] = True
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""

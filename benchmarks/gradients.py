@@ -10,7 +10,8 @@ which see jumps that no derivative sees. All begin in one state, with its comman
 differences agree among themselves bounds that: by two sizes of the shift, and between two halves of the environments.
 The standard error of what they differ by, relative to the differences, tells how much other environments would change.
 In float64, tiny differences of single environments, which meet no jump, tell whether the derivative itself is right.
-The contacts are the paper's springs, without the robots that have dry friction, and MuJoCo's own. Writes gradients.csv.
+The contacts are the paper's springs, without the robots that have dry friction, MuJoCo's own, and MuJoCo's that begin
+over 20 mm. Writes gradients.csv.
 """
 
 from __future__ import annotations
@@ -22,21 +23,25 @@ from pathlib import Path
 from typing import Any
 
 import common
+import mujoco
+import numpy as np
 import torch
 from common import Part, measured, run
-from tables import Row, grouped
+from tables import Row, grouped, numbers
 from torch import Tensor
 
 import diffsim
 from diffsim import DiffEnv, SceneError
+from diffsim.robot.constants import soften
 from diffsim.training import Count
 from diffsim.training.evaluation import SEED
 
 GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "soft": {"contact": "soft"},
     "mujoco": {"contact": "mujoco"},
+    "onset 20 mm": {"contact": "mujoco", "onset": 0.02},
 }
-ROLLOUTS = 4, 8, 16  # control steps
+ROLLOUTS = 4, 8, 16, 32  # control steps
 TINY, FEW = 1e-6, 32  # the shift in float64, and of how many environments at most
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
 AGREE, CHANCE = 0.9, 0.5  # the page shows cosines where differences by SHIFT and by half of it agree better than by
@@ -49,6 +54,7 @@ Policy = Callable[[Tensor], Tensor | float]
 class Args(common.CheckpointFlags):
     num_envs: Count = 1024  # environments
     horizons: tuple[Count, ...] = ROLLOUTS  # control steps of a rollout
+    grounds: tuple[str, ...] = tuple(GROUNDS)  # contacts
     directions: Count = 12  # of the shift, at most: random ones where there are more controls
     warmup: Count = 150  # control steps before the rollout
 
@@ -130,8 +136,13 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     if task not in diffsim.TASKS:
         case = common.load_case(path, 1, "cpu")
         task, learner, policy = case.env.task.name, case.saved.script, case.saved.network
-    for ground, contact in GROUNDS.items():
-        options = contact | {"horizon": max(args.horizons), "early_termination": False, "max_episode_steps": 10**9}
+    for ground in args.grounds:
+        options: dict[str, Any] = {
+            "horizon": max(args.horizons),
+            "early_termination": False,
+            "max_episode_steps": 10**9,
+        }
+        options |= GROUNDS[ground]
         try:
             env = diffsim.make(task, n, **options)  # in which no episode ends: a reset within a rollout is no slope
             exact = diffsim.make(task, min(n, FEW), **options, dtype=torch.float64, tolerance=1e-10)
@@ -156,23 +167,60 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each policy on MuJoCo's contact; no cosine that chance decides, or of differences that disagree."""
+    """A line for each policy on each of MuJoCo's; no cosine that chance decides, or of differences that disagree."""
     lines = list[Row]()
-    hard = [row for row in rows if row["ground"] == "mujoco"]
-    for (task, learner), own in grouped(hard, "task", "learner").items():
+    hard = [row for row in rows if row["ground"] != "soft"]
+    for (task, learner, ground), own in grouped(hard, "task", "learner", "ground").items():
         sure = [row for row in own if float(row["differences"]) > AGREE and float(row.get("chance") or 0) < CHANCE]
         if not sure:
             continue
         cosines = {int(row["horizon"]): row["cosine"] for row in sure}
         ratios = {int(row["horizon"]): row.get("ratio", "") for row in sure}
         line = {f"cosine, {k} steps": cosines.get(k, "") for k in ROLLOUTS}
-        name = task if learner == "noise" else f"{task}, {learner}"
+        name = ", ".join((task, *(x for x in (learner, ground) if x not in ("noise", "mujoco"))))
         lines.append({"task": name} | line | {"ratio, 8 steps": ratios.get(8, "")})
     return lines
 
 
+LOOKS = ("C3o-", "mujoco"), ("C0o-", "onset 20 mm")
+POOR = 0.95  # the picture has tasks with a cosine below
+BALL = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+<body pos="0 0 0.1"><freejoint/><geom type="sphere" size="0.1" mass="1"/></body></worldbody></mujoco>"""
+
+
+def force(heights: np.ndarray, onset: float) -> list[float]:
+    """MuJoCo's force on a ball of 1 kg at rest [N], its lowest point at `heights` [m], by an onset [m]."""
+    model = mujoco.MjModel.from_xml_string(BALL)
+    model.geom_solimp[:] = [soften(row, onset) for row in model.geom_solimp]
+    data, found = mujoco.MjData(model), []
+    for height in heights:
+        data.qpos[2] = 0.1 + height
+        mujoco.mj_forward(model, data)
+        found.append(float(data.qfrc_constraint[2]))
+    return found
+
+
+def panels(rows: list[dict[str, str]]) -> list[common.Panel]:
+    """What a soft onset does to the force, and to the gradients of rollouts where they need it."""
+    height = np.linspace(0.002, -0.02, 221)
+    looks = {"C3-": 0.0, "C1-": 0.005, "C0-": 0.02}
+    balls = [
+        common.Line(1e3 * height, force(height, m), look, f"{1e3 * m:g} mm" if m else "the file's default")
+        for look, m in looks.items()
+    ]
+    found = [common.Panel(balls, "", "lowest point of a ball [mm]", "force [N]")]
+    for (task,), own in grouped([row for row in rows if row["learner"] == "noise"], "task").items():
+        if any(row["ground"] == "onset 20 mm" for row in own) and min(numbers(own, "cosine")) < POOR:
+            drawn = [(look, [row for row in own if row["ground"] == name]) for look, name in LOOKS]
+            curves = [common.Line(numbers(some, "horizon"), numbers(some, "cosine"), look) for look, some in drawn]
+            found.append(common.Panel(curves, task, "steps of a rollout", "cosine with differences"))
+    return found
+
+
 def main(args: Args) -> None:
-    measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
+    common.check_names("--grounds", args.grounds, GROUNDS)
+    rows = measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
+    common.plot(args.picture("onset"), [panels(rows)], (3.4, 2.6))
 
 
 if __name__ == "__main__":

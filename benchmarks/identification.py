@@ -105,7 +105,7 @@ def measure(name: str, case: Case, log: Path) -> list[dict[str, object]]:
     true = CHANGE * torch.randn(len(unknowns.labels), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     sim.parameters = unknowns.values(true)
     write_log(log, sim, case.policy)
-    _, found, covariance = identify.estimate(scene, identify.read_log(log, scene), case.fit, case.only)
+    _, found, covariance, _ = identify.estimate(scene, identify.read_log(log, scene), case.fit, case.only)
     determined = int((torch.linalg.eigvalsh(covariance) < identify.KNOWN**2).sum())
     columns = [unknowns.numbers(x) for x in (0 * true, true, found)]
     rows = list[dict[str, object]]()

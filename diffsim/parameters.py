@@ -212,6 +212,9 @@ class _Robot:
             getattr(m, field)[place] = arrays[name]
         for k, tied in enumerate(self.tied, 1):
             m.actuator_biasprm[tied, k] = -arrays["gain"][tied]
+        moved = np.flatnonzero((m.body_ipos != self.m.body_ipos).any(1))  # such frames are no longer the body's
+        m.body_sameframe[moved] = 0
+        m.geom_sameframe[np.isin(m.geom_bodyid, moved)] = m.site_sameframe[np.isin(m.site_bodyid, moved)] = 0
         mujoco.mj_setConst(m, mujoco.MjData(m))
         return m
 
@@ -238,6 +241,12 @@ class _Robot:
             if not bool(kept.all()):
                 place = tuple((~kept).nonzero()[0].tolist())
                 raise ValueError(f"{name}[{', '.join(map(str, place))}] is {found[place].item()}, must {rule}")
+        simple = torch.tensor(self.m.body_simple != 0)[:, None]
+        if name == "com" and bool((fixed := simple & (found != file)).any()):
+            which = label(self.m, mujoco.mjtObj.mjOBJ_BODY, int(fixed.nonzero()[0, 0]))
+            raise ValueError(
+                f'com of body {which} is its origin to MuJoCo, which simplifies: write <body simple="false">'
+            )
         if name == "inertia" and bool((wrong := 2 * found.amax(1) > (1 + 1e-6) * found.sum(1)).any()):
             body = int(wrong.nonzero()[0])
             raise ValueError(f"inertia[{body}] is {found[body].tolist()}: a moment exceeds the sum of the two others")

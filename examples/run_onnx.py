@@ -70,13 +70,18 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--video", help="an .mp4 instead of the window, which needs a display; needs imageio-ffmpeg")
     args = parser.parse_args()
+    if not Path(args.policy).is_file():
+        parser.error(f"no such file: {args.policy}; write one by python -m diffsim export CHECKPOINT {args.policy}")
     try:
         policy = InferenceSession(args.policy)
     except Exception as error:  # onnxruntime has a class for each status
         parser.error(f"{args.policy} cannot be read: {error}")
     told = policy.get_modelmeta().custom_metadata_map
     if "command_range" not in told:
-        parser.error(f"{args.policy}: a policy of {told.get('task')}, which follows no commands")
+        parser.error(
+            f"{args.policy}: a policy of {told.get('task')}, which follows no commands as those of go1, go2 and g1; "
+            "examples/own_quadruped.py shows how to play another one in MuJoCo"
+        )
     if any(abs(x) > float(most) for x, most in zip(args.command, told["command_range"].split(","), strict=True)):
         parser.error(f"--command: of a {told['task']} at most {told['command_range']} to either side")
     model = mujoco.MjModel.from_xml_path(args.model or f"{Path(__file__).parents[1]}/diffsim/assets/{told['task']}.xml")

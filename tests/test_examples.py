@@ -126,6 +126,33 @@ def test_identify(
     assert max(float(row["deviation"]) for row in rows) < 0.02
 
 
+def test_identify_finds_a_friction_below_that_of_floor_and_feet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both have the same in the file, as most files do; a contact has the larger one, so lowering one has no effect."""
+    module, robot, log = load("identify"), tmp_path / "hopper.xml", tmp_path / "log.csv"
+    spec = mujoco.MjSpec.from_file(str(ASSETS / "hopper.xml"))
+    for geom in spec.geoms:
+        geom.friction[0] = 0.9
+    spec.compile()
+    robot.write_text(spec.to_xml())
+    sim = ParametricSimulator(load_scene(robot), 1, diffsim.Integration("mujoco", 1))
+    sim.parameters = {"friction": torch.full_like(sim.parameters["friction"], 0.3)}
+    identification.write_log(log, sim)
+    module.main(robot, log, ("mass", "friction"))
+    fitted = {(row["parameter"], row["element"]): row for row in tables.read_csv(tmp_path / "log.fit.csv")}
+    assert float(fitted["friction", "foot"]["fitted"]) == pytest.approx(0.3, rel=0.05)
+    assert all(
+        float(row["fitted"]) == pytest.approx(float(row["file"]), rel=0.02)
+        for key, row in fitted.items()
+        if key[0] == "mass"
+    )
+    assert ("friction", "floor") not in fitted and "Not converged" not in capsys.readouterr().out
+    monkeypatch.setattr(module, "ITERATIONS", 1)
+    module.main(robot, log, ("mass", "friction"))
+    assert "Not converged" in capsys.readouterr().out
+
+
 def test_identify_tells_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("time,qpos0\n0,1\n1,2\n")
@@ -200,6 +227,25 @@ def test_onnx_without_a_display_is_one_line(arguments: list[str], hint: str, tmp
     blind |= PATH | {"MUJOCO_GL": "glfw"}
     found = subprocess.run(command, env=blind, cwd=tmp_path, capture_output=True, text=True)
     assert found.returncode == 2 and hint in found.stderr.splitlines()[-1] and not list(tmp_path.glob("*.mp4"))
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ("", "no such file: policy.onnx; write one by python -m diffsim export CHECKPOINT policy.onnx"),
+        (
+            "hopper",
+            "a policy of hopper, which follows no commands as those of go1, go2 and g1; examples/own_quadruped.py",
+        ),
+    ],
+)
+def test_onnx_that_cannot_be_walked_is_one_line(policy: str, message: str, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    if policy:
+        main(["export", str(POLICIES / f"{policy}.pt"), str(tmp_path / "policy.onnx")])
+    command = [sys.executable, ROOT / "examples" / "run_onnx.py", "policy.onnx"]
+    found = subprocess.run(command, env=os.environ | PATH, cwd=tmp_path, capture_output=True, text=True)
+    assert found.returncode == 2 and message in found.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("name, file", [("go2", "go2.xml"), ("go2", "motors.xml"), ("g1", "g1.xml")])

@@ -17,7 +17,7 @@ from test_constraint import CONES, STATES, H, check_gradients, in_mujoco, mujoco
 
 from diffsim.robot import types
 from diffsim.robot.constants import constrained
-from diffsim.robot.pairs import with_pairs
+from diffsim.robot.pairs import first_contacts, room_of, with_pairs
 from diffsim.robot.scene import FACTORS
 from diffsim.robot.shapes import as_primitives
 from diffsim.robot.types import SceneError
@@ -96,7 +96,7 @@ def test_tree_gradient_is_that_of_differences(base, rng):
 
 # A crank and a rocker, whose coupler closes the loop at sites, and a gripper whose fingers mirror each other.
 FOUR_BAR = """
-<mujoco> <option timestep="0.002"/>
+<mujoco> <option timestep="0.002"/> <default> <geom contype="0" conaffinity="0"/> </default>
   <worldbody>
     <body name="crank"> <joint name="crank" axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 0 0 .1" size=".01"/>
       <body pos="0 0 .1"> <joint axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 .3 0 .05" size=".01"/>
@@ -403,10 +403,51 @@ def test_fixed_shapes_that_would_overlap_at_the_start_are_left_out():
         f'<body pos=".45 .45 {z}"> <joint type="slide"/> <geom name="ball {z}" size=".05"/> </body>' for z in (0, 1)
     )
     scene = parse(robot(f'{balls} <geom name="table" type="cylinder" size=".5 .02"/>', "", ""))
-    (first, second), (pair,) = (scene.mj_model.geom(f"ball {z}").id for z in (0, 1)), scene.geom_pairs
-    assert second in pair and first not in pair
+    first, second, table = (scene.mj_model.geom(name).id for name in ("ball 0", "ball 1", "table"))
+    assert {frozenset(pair) for pair in scene.geom_pairs} == {frozenset((first, second)), frozenset((second, table))}
     sentence = "Left out, because such shapes overlap at the start: contact of the geoms 'table' and 'ball 0'."
     assert sentence in approximations(scene)
+
+
+# A hand of two links on a table with a drawer, a door in a frame, and a second hand
+KITCHEN = """
+<mujoco> <default> <geom density="100"/> </default> <worldbody>
+  <body name="table"> <geom name="top" type="box" size=".3 .3 .02" pos="0 0 -.05"/>
+    <body name="hand"> <joint type="slide" axis="0 1 0"/> <joint type="slide" axis="1 0 0"/>
+      <geom name="palm" size=".1"/>
+      <body name="finger"> <joint axis="0 0 1"/> <geom name="finger" type="capsule" fromto="0 0 0 .3 0 0" size=".04"/>
+        <body name="tip" pos=".3 0 0"> <joint axis="0 0 1"/> <geom name="tip" size=".05"/> </body> </body> </body>
+    <body name="drawer" pos="0 .3 .1"> <joint type="slide" axis="0 1 0" damping="2"/>
+      <geom name="drawer" type="box" size=".2 .02 .1"/> </body> </body>
+  <body name="frame" pos=".5 .3 0"> <geom name="frame" size=".03"/>
+    <body name="leaf"> <joint axis="0 0 1" damping=".2"/>
+      <geom name="leaf" type="box" size=".1 .02 .3" pos="-.1 0 0"/> </body> </body>
+  <body name="other" pos=".1 -.2 0"> <joint type="slide" axis="0 1 0"/> <geom name="other" size=".08"/> </body>
+  </worldbody> <contact> <exclude body1="drawer" body2="other"/> </contact> </mujoco>"""
+
+
+def test_doors_drawers_and_second_arms_touch_as_in_mujoco(rng):
+    """Without `with_pairs`; a robot's own parts, of one tree with its fixed base, do not."""
+    scene = parse(KITCHEN)
+    m, bodies = scene.mj_model, ("hand", "finger", "tip")
+    found = {frozenset(m.geom(geom).name for geom in pair) for pair in scene.geom_pairs}
+    hand, rest = ("palm", "finger", "tip"), ("drawer", "leaf", "other", "frame")
+    expected = {frozenset(pair) for pair in product(hand, rest)} | {
+        frozenset(pair)
+        for pair in [("drawer", "leaf"), ("drawer", "frame"), ("leaf", "other"), ("frame", "other")]
+        + [("top", "leaf"), ("top", "other")]
+    }
+    assert found == expected
+    spec, n = mujoco.MjSpec.from_string(KITCHEN), 48
+    for part, base in [("tip", "hand"), *product((*bodies, "drawer"), ["table"]), ("leaf", "frame")]:
+        spec.add_exclude(bodyname1=part, bodyname2=base)
+    own = model_as_it_is(parse(spec.to_xml()))
+    qpos, qvel = 0.1 * rng.normal(size=(n, scene.nq)), 0.3 * rng.normal(size=(n, scene.nv))
+    states = qpos, qvel, np.zeros((n, 0))
+    expected, found = in_mujoco(scene, *states, model=own)[1], step(scene, states)[1]
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+    alone = step(dataclasses.replace(scene, geom_pairs=()), states)[1]
+    assert (abs(found - alone).max(1) > 1e-3).sum() > n / 2
 
 
 def apart_from_itself(scene):
@@ -581,7 +622,7 @@ def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
         depth = {pair: -contact.dist for pair, contact in zip(ends, data.contact, strict=True) if pair in pairs}
         touching.append(sorted(depth, key=depth.get))
     numbers = np.array([len(each) for each in touching])
-    monkeypatch.setattr(types, "MOST_PAIRS", 2)
+    monkeypatch.setattr(types, "MOST_ROOM", 2)
     _, qvel, residual = step(scene, states)
     assert ((residual > 1e-4) == (numbers > 2)).all() and 2 in numbers
     for k in np.flatnonzero(numbers > 2).tolist():
@@ -589,6 +630,33 @@ def test_contacts_beyond_the_bound_are_told(rng, monkeypatch):
         expected = step(alone, [x[k : k + 1] for x in states])[1]
         np.testing.assert_allclose(qvel[k], expected[0], rtol=1e-8, atol=1e-8)
     assert any(each[0] != max(each) for each in touching if len(each) > 2)
+
+
+def wall(rows, columns):
+    """Bricks that stand on each other."""
+    bricks = "".join(
+        f'<body pos="{0.41 * column + 0.2 * (row % 2)} {0.001 * (-1) ** column} {0.0499 + 0.0998 * row}"> <freejoint/> '
+        '<geom type="box" size=".2 .1 .05"/> </body>'
+        for row, column in product(range(rows), range(columns))
+    )
+    return parse(robot(bricks))
+
+
+@pytest.mark.parametrize("rows, columns", [(2, 2), pytest.param(4, 4, marks=SLOW)])
+def test_there_is_room_for_the_contacts_of_a_wall(rows, columns, rng, monkeypatch):
+    """Its contacts at the start are more than the room that other scenes have, which is not enough for them."""
+    monkeypatch.setattr(types, "LEAST_ROOM", 4)
+    scene = wall(rows, columns)
+    number = first_contacts(scene)
+    assert number > (64 if rows == 4 else 4) and room_of(scene) >= 2 * number
+    assert not [line for line in approximations(scene) if "deepest" in line]
+    states = scene.qpos0[None].repeat(4, 0), 0.02 * rng.normal(size=(4, scene.nv)), np.zeros((4, 0))
+    expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+    qvel, residual = step(scene, states)[1:]
+    np.testing.assert_allclose(qvel, expected, rtol=1e-8, atol=1e-8)
+    assert residual.max() < 1e-10
+    monkeypatch.setattr(types, "MOST_ROOM", number - 1)
+    assert f"Of the {number} contacts between bodies at the start only the {number - 1} deepest act." in report(scene)
 
 
 @pytest.mark.gpu

@@ -202,6 +202,39 @@ def test_gradients_are_those_of_rebuilt_models(name: str, rng: np.random.Generat
     assert {"friction"} <= tested if two else {"armature", "gain"} <= tested
 
 
+PARCEL = """<mujoco><worldbody><geom type="plane" size="9 9 .1"/><body name="parcel" pos="0 0 .098" {}><freejoint/>{}
+    <geom type="box" size=".1 .1 .1" density="500"/><site/></body></worldbody></mujoco>"""
+
+
+def test_the_centre_of_a_free_body_may_move(rng: np.random.Generator) -> None:
+    """Of a parcel whose shape is centred in the file; against a compiled inertial. MuJoCo must not simplify it."""
+    sim = ParametricSimulator(parse(PARCEL.format("", "")), 4, HARD, HARD.substeps * H, dtype=torch.float64)
+    com = sim.parameters["com"]
+    sim.parameters = {"com": com}
+    com[1, 0] = 0.02
+    with pytest.raises(
+        ValueError, match="^com of body 'parcel' is its origin to MuJoCo, which simplifies: write <body"
+    ):
+        sim.parameters = {"com": com}
+    if tuple(map(int, mujoco.__version__.split(".")[:2])) < (4, 0):
+        return
+    scene = parse(PARCEL.format('simple="false"', ""))
+    sim = ParametricSimulator(scene, 4, HARD, HARD.substeps * H, dtype=torch.float64)
+    com = sim.parameters["com"]
+    com[1] = torch.tensor([0.02, -0.01, 0.03])
+    com.requires_grad_()
+    sim.parameters = {"com": com}
+    mass, inertia, place = (" ".join(map(str, x)) for x in ([4.0], [4 * 0.02 / 3] * 3, com[1].tolist()))
+    written = parse(PARCEL.format("", f'<inertial pos="{place}" mass="{mass}" diaginertia="{inertia}"/>'))
+    states = scene.qpos0[None].repeat(4, 0), 0.1 * rng.normal(size=(4, 6)), np.zeros((4, 0))
+    expected = in_mujoco(scene, *states, substeps=HARD.substeps, model=mujoco_model(written))[1]
+    qvel = sim.step(*(torch.tensor(x) for x in states))[1]
+    np.testing.assert_allclose(qvel.detach().numpy(), expected, rtol=1e-8, atol=1e-9)
+    assert abs(expected - in_mujoco(scene, *states, substeps=HARD.substeps)[1]).max() > 1e-3
+    qvel.sum().backward()
+    assert bool(com.grad[1].any())
+
+
 STEPPED = "floating", "pyramids", "ball", "Euler's servos", "bounded servos", "tied", *TOUCHING
 
 

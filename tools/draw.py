@@ -100,7 +100,7 @@ def films(
     start: float = 2.0,
     seconds: tuple[float, float] = (4.0, 5.0),
 ) -> None:
-    """A film of each policy, called as its task.
+    """A film of each policy, called as its task, and as its contact if that is not the task's.
 
     Args:
         checkpoints: files of any script. Default: the shipped policies.
@@ -138,7 +138,9 @@ def films(
                 below = diagrams(case.env.scene, sides[name].qpos, size[0])
                 shown[name] = [np.concatenate(both) for both in zip(frames, below, strict=True)]
         frames = [np.concatenate(row, axis=1) for row in zip(*shown.values(), strict=True)]
-        path = save_webp(FIGURES / f"{task.name}.webp", frames, fps)
+        contact = case.env.sim.integration.contact
+        name = task.name if contact == task.contact else f"{task.name}_{contact}"
+        path = save_webp(FIGURES / f"{name}.webp", frames, fps)
         print(f"{path}, {len(frames) / fps:.2f} s, {fps:.0f} frames/s, {path.stat().st_size / 1000:.0f} kB")
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from diffsim.robot.contacts import ground_pairs, pair_law
 from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed, takes_euler
-from diffsim.robot.pairs import rows_of
+from diffsim.robot.pairs import room_of, rows_of
 from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
 from diffsim.robot.types import Array, Constraints, SceneError
 
@@ -79,6 +79,7 @@ def constrained(scene: Scene, seconds: float, single: bool = True, onset: float 
             limit,
             np.array([(0.0, 1.0, 0.0), *loss]),
             rows_of(scene, row, touch),
+            room_of(scene),
         ),
     )
 

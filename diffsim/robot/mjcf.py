@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from diffsim.robot.actuator import force_bounds, gear_of, on_joint, servo_sums, transmissions_of
 from diffsim.robot.contacts import contact_points, ground_pairs, matrix_of
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, muscles, numeric, servos
-from diffsim.robot.pairs import with_obstacles, with_pairs
+from diffsim.robot.pairs import with_defaults
 from diffsim.robot.refuse import beyond, obstacles, strays
 from diffsim.robot.scene import Scene, Spheres
 from diffsim.robot.types import Array, SceneError
@@ -26,6 +26,11 @@ DOFS = {int(Joint.mjJNT_FREE): 6, int(Joint.mjJNT_BALL): 3}  # of joints with se
 
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
     """Read an MJCF file or copy a model.
+
+    What touches in the file touches here on MuJoCo's contact: the ground, fixed geoms, free bodies, and what moves by
+    joints of its own, such as a door, a drawer or a second arm. Only the parts of one robot, a tree of bodies with its
+    fixed base, pass through each other until `with_pairs`, unless the file has a free body beside another tree. To let
+    bodies pass, exclude them in the file, or all by dataclasses.replace(scene, geom_pairs=()).
 
     Example:
         scene = diffsim.load_scene("robot.xml")
@@ -55,14 +60,17 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     if left_out := [] if isinstance(path, mujoco.MjModel) else strays(model):
         spec = path.copy() if isinstance(path, mujoco.MjSpec) else mujoco.MjSpec.from_file(str(file))
         for body in left_out:
+            gone = {spec.body(body), *spec.body(body).find_all("body")}
+            gone_names = {each.name for each in gone}
+            for looking in (*spec.cameras, *spec.lights):  # which only draw, and would miss what they look at
+                looking.targetbody = "" if looking.targetbody in gone_names else looking.targetbody
             spec.delete(spec.body(body))  # with its joints, their actuators and numbers of keyframes
         model = spec.compile()
     _obey_flags(model)
     _refuse(file, obstacles(model))
     scene = dataclasses.replace(_Reader(model, file).scene(), left_out=tuple(left_out))
     _refuse(file, beyond(scene))
-    beside = model.ntree > 1 and Joint.mjJNT_FREE in model.jnt_type
-    return with_pairs(scene) if beside else with_obstacles(scene)
+    return with_defaults(scene)
 
 
 def _refuse(file: Path, found: list[str]) -> None:

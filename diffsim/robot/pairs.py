@@ -9,10 +9,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from diffsim.robot import types
 from diffsim.robot.contacts import UNBOUNDED, collide, declared_pairs, matrix_of, pair_law
 from diffsim.robot.elements import at_rest, disabled_flags, label
 from diffsim.robot.scene import Scene
-from diffsim.robot.shapes import as_primitives, is_exact, obstacle_geoms
+from diffsim.robot.shapes import as_primitives, is_exact
 from diffsim.robot.types import (
     BALL_BOX,
     BOXES,
@@ -22,6 +23,7 @@ from diffsim.robot.types import (
     JOINT,
     PARALLEL,
     POINT,
+    ROOM_OF_TREE,
     SEGMENTS,
     TURN,
     Array,
@@ -158,14 +160,17 @@ def self_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
     return found
 
 
-def obstacle_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
-    """List the pairs with such a geom."""
-    fixed = obstacle_geoms(m)
-    return [pair for pair in self_pairs(m) if fixed[list(pair)].any()]
+def default_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
+    """List the pairs that touch without with_pairs, see load_scene."""
+    pairs, body = np.array(self_pairs(m), int).reshape(-1, 2), m.geom_bodyid
+    tree, root = m.body_treeid[body[pairs]], m.body_rootid[body[pairs]]
+    own = (tree[:, 0] == tree[:, 1]) | ((tree.min(1) < 0) & (root[:, 0] == root[:, 1]))  # or of the tree's fixed base
+    free = m.ntree > 1 and (m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
+    return [(a, b) for a, b in pairs[free | ~own].tolist()]
 
 
 def with_pairs(scene: Scene) -> Scene:
-    """Return a copy whose parts touch each other and fixed geoms as the file lets them, on MuJoCo's contact.
+    """Return a copy in which a robot's own parts touch each other, too, as the file lets them, on MuJoCo's contact.
 
     Example:
         from diffsim.robot.pairs import with_pairs
@@ -180,9 +185,9 @@ def with_pairs(scene: Scene) -> Scene:
     return _with(scene, self_pairs(scene.mj_model))
 
 
-def with_obstacles(scene: Scene) -> Scene:
-    """Return a copy whose parts touch fixed geoms beside the ground, and not each other; itself without such geoms."""
-    pairs = obstacle_pairs(scene.mj_model)
+def with_defaults(scene: Scene) -> Scene:
+    """Return a copy whose pairs are the default ones; itself without any."""
+    pairs = default_pairs(scene.mj_model)
     return _with(scene, pairs) if pairs else scene
 
 
@@ -222,6 +227,21 @@ def touching_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
 def touching(data: mujoco.MjData) -> set[tuple[int, int]]:
     """Return the pairs of geoms of MuJoCo's contacts, the lower one first."""
     return {(min(a, b), max(a, b)) for a, b in data.contact.geom.tolist()}
+
+
+def first_contacts(scene: Scene) -> int:
+    """Count the contacts of pairs in the reference pose or the keyframe that has most of them."""
+    pairs, most = set(scene.geom_pairs), 0
+    for data in first_poses(as_primitives(scene.mj_model)) if pairs else ():
+        mujoco.mj_collision(data.model, data)
+        most = max(most, sum((min(a, b), max(a, b)) in pairs for a, b in data.contact.geom.tolist()))
+    return most
+
+
+def room_of(scene: Scene) -> int:
+    """Return the room for contacts of pairs at once: more for many bodies, or if there are many at first."""
+    wanted = max(ROOM_OF_TREE * scene.mj_model.ntree, 2 * first_contacts(scene))
+    return min(max(types.LEAST_ROOM, wanted), types.MOST_ROOM)
 
 
 def rows_of(scene: Scene, row: Row, touch: Touch) -> Pairs | None:

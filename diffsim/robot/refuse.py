@@ -46,8 +46,10 @@ ZERO = """geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_da
     actuator_armature actuator_delay""".split()
 FINITE = """body_pos body_quat geom_friction geom_margin geom_gap geom_solmix geom_solref geom_solimp pair_friction
     pair_margin pair_gap pair_solref pair_solimp jnt_margin jnt_solref jnt_solimp dof_solref dof_solimp
-    dof_frictionloss eq_data eq_solref eq_solimp""".split()
+    dof_frictionloss eq_data eq_solref eq_solimp key_qpos key_qvel key_ctrl""".split()
 POSITIVE = "jnt_stiffness dof_armature dof_damping dof_frictionloss geom_friction geom_solmix pair_friction".split()
+# Least pivot of the mass matrix, as a part of its diagonal, with at most so many joints from a leaf on
+IDLE, SHORT = 1e-7, 8
 # What a file calls them, where that is another word
 WORDS = {"limited": "range", "actfrclimited": "actuatorfrcrange"}
 WORDS |= {"stiffnesspoly": "a second number of stiffness", "dampingpoly": "a second number of damping"}
@@ -158,17 +160,24 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
 
 
 def _inertia(m: mujoco.MjModel) -> Iterator[Row]:
-    matrix, idle = mass_matrix(m), np.zeros(m.nv, bool)
-    for tree in range(m.ntree):
-        dofs = np.flatnonzero(m.dof_treeid == tree)
-        part = matrix[np.ix_(dofs, dofs)]
-        scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
-        part = part / np.outer(scale, scale)
-        try:
-            np.linalg.cholesky(part - 1e-7 * np.eye(len(dofs)))  # in a fraction of the time of eigenvalues
-        except np.linalg.LinAlgError:
-            values, shapes = np.linalg.eigh(part)
-            idle[dofs] = np.abs(shapes[:, values < 1e-7]).max(1, initial=0.0) > 0.1
+    """Find motions without inertia: pivots of the mass matrix, from the leaves on, that are as good as zero.
+
+    In a chain of n equal links a pivot is about M_ii / n^3, so the bound follows the number of joints beyond.
+    """
+    matrix, idle, beyond = mass_matrix(m), np.zeros(m.nv, bool), np.ones(m.nv)
+    pivots, ways = matrix.copy(), list[list[int]]()  # from each to the world
+    for dof, parent in enumerate(m.dof_parentid.tolist()):
+        ways.append([dof, *ways[parent]] if parent >= 0 else [dof])
+    for dof in reversed(range(m.nv)):
+        pivot, above = pivots[dof, dof], ways[dof][1:]
+        if pivot <= IDLE * min(1.0, (SHORT / beyond[dof]) ** 3) * matrix[dof, dof]:
+            near = [k for k, way in enumerate(ways) if dof in way[:SHORT]]  # of which some move against others
+            scale = np.sqrt(np.maximum(matrix[near, near], 1e-300))
+            shape = np.linalg.eigh(matrix[np.ix_(near, near)] / np.outer(scale, scale))[1][:, 0]
+            idle[np.array(near)[np.abs(shape) > 0.1]] = True
+        elif above:
+            beyond[above[0]] = max(beyond[above[0]], beyond[dof] + 1)
+            pivots[np.ix_(above, above)] -= np.outer(pivots[above, dof], pivots[dof, above]) / pivot
     yield "joint", np.isin(range(m.njnt), m.dof_jntid[idle]), "they have a motion without inertia"
 
 

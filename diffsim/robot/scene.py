@@ -117,7 +117,7 @@ class Scene:
     viscosity: float = 0.0  # kg/(m s)
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     left_out: tuple[str, ...] = ()  # bodies of the file beside the robot, which move by themselves and touch nothing
-    geom_pairs: tuple[tuple[int, int], ...] = ()  # of the robot's geoms that may touch each other, see robot/pairs.py
+    geom_pairs: tuple[tuple[int, int], ...] = ()  # of geoms that may touch each other, see load_scene
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constants.py
     transmissions: Transmissions | None = None  # actuators on fixed tendons and at sites, whose motor_link is 0
     parameters: int = 0  # number of constants whose gradients the backward kernel computes, see diffsim/parameters.py

@@ -21,7 +21,8 @@ FEATURES = {
     CAPSULE_BOX: "capsule_box_geoms",
     BOXES: "box_geoms",
 }
-MOST_PAIRS = 64  # contacts at once, in the environments that a thread steps together
+LEAST_ROOM, MOST_ROOM = 64, 512  # for contacts of pairs at once, in the environments that a thread steps together
+ROOM_OF_TREE = 8  # contacts at once, in a scene of many trees of bodies
 
 
 class SceneError(ValueError):
@@ -106,12 +107,11 @@ class Pairs(NamedTuple):
         places, which = np.unique(all_of.reshape(-1, 4), axis=0, return_inverse=True)
         return places, which.reshape(-1, 2)
 
-    @property
-    def sizes(self) -> PairSizes:
-        """Return sizes of the kernels' arrays."""
+    def sizes(self, room: int) -> PairSizes:
+        """Return sizes of the kernels' arrays, with room for so many contacts at once."""
         equalities, number = int((self.kind != GEOMS).sum()), len(self.kind)
         heads, most = equalities + int((self.contacts > 0).sum()), int(self.contacts.max(initial=1))
-        return PairSizes(equalities, heads, most, len(self.places[0]), min(number, equalities + MOST_PAIRS) + most)
+        return PairSizes(equalities, heads, most, len(self.places[0]), min(number, equalities + room) + most)
 
 
 class Constraints(NamedTuple):
@@ -124,6 +124,12 @@ class Constraints(NamedTuple):
     limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
     loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
     pairs: Pairs | None = None  # rows between two bodies, see robot/pairs.py
+    room: int = LEAST_ROOM  # for contacts of pairs at once
+
+    @property
+    def pair_sizes(self) -> PairSizes:
+        """Return sizes of the kernels' arrays for the rows between two bodies."""
+        return self.pairs.sizes(self.room) if self.pairs else PairSizes()
 
     @property
     def rough(self) -> bool:

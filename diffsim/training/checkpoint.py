@@ -72,7 +72,10 @@ class SavedPolicy:
         """
         trained = self.args["env"]
         if (own := FILE.fullmatch(trained)) and given is None:
-            fail(f"a policy of your own task: give its file, whose code runs, by --env {trained} (drive: as robot)")
+            fail(
+                f"a policy of your own task, whose code runs only if you name its file: add --env {trained}, or give "
+                "drive the file in place of the robot"
+            )
         if given is not None and not own and base_name(given) in {*TASKS} - {base_name(trained)}:
             fail(f"a policy that was trained on {trained}, not on {given}")
         return given or trained
@@ -124,8 +127,9 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
         form = state["format"]
         whole = whole and (form != FORMAT or state.keys() >= POLICY)
         if whole and form == FORMAT:
+            whole = isinstance(state["script"], str) and isinstance(state["args"]["env"], str)
             shown = *state["args"], *state["args"].values(), *(state.get(name) for name in SHOWN)
-            whole = not any(CONTROL.search(str(text)) for text in shown)
+            whole &= not any(CONTROL.search(str(text)) for text in shown)
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         whole = False
     if not whole:

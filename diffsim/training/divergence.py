@@ -1,7 +1,8 @@
-"""Find what of a training is no finite number any more."""
+"""Find what of a training is no finite number any more, or never had a gradient."""
 
 from __future__ import annotations
 
+import torch
 from torch import nn
 
 from diffsim.env import DiffEnv
@@ -29,3 +30,20 @@ def find_observation(learner: Learner | None, env: DiffEnv | None) -> int | None
     seen += [env.state_dict()["obs"]] if env is not None else []
     columns = [(~obs.isfinite()).any(0).nonzero().flatten().tolist() for obs in seen]
     return next((found[0] for found in columns if found), None)
+
+
+@torch.enable_grad()
+def reward_has_gradient(env: DiffEnv) -> bool:
+    """Tell whether the reward depends smoothly on the robot's state, at the environments' states and near them."""
+    generator = torch.Generator(env.device).manual_seed(0)  # a training's random numbers stay the same
+
+    def draw(like: torch.Tensor) -> torch.Tensor:
+        return torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
+
+    qpos, qvel = ((x.detach() + 0.05 * draw(x)).requires_grad_() for x in (env.qpos, env.qvel))
+    action = (0.3 * draw(env.qpos.new_zeros(env.num_envs, env.scene.nu))).clamp(-1.0, 1.0)
+    reward = env.task.reward(env.observe(qpos, qvel, action), action)
+    if not reward.requires_grad:
+        return False
+    slopes = torch.autograd.grad(reward.sum(), (qpos, qvel), allow_unused=True)
+    return any(slope is not None and bool(slope.any()) for slope in slopes)

@@ -35,6 +35,7 @@ class Flags:
 
     fixed: ClassVar[tuple[str, ...]] = ()  # flags of a script that --resume keeps
     processes: ClassVar[bool] = True  # whether torchrun may split its environments among several
+    differentiates: ClassVar[bool] = False  # whether it learns from the gradient of the reward
 
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
     seed: Seed = 1

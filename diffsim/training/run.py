@@ -101,6 +101,11 @@ class Run:
         self._env = make_env(self.args, num_envs // processes, horizon, seed, **options)
         if varied_by is not None:
             self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
+        if self.args.differentiates and not divergence.reward_has_gradient(self._env):
+            self.message(
+                f"the reward of {self.args.env} has no gradient in the robot's state: it is detached, jumps or is an "
+                f"integer. {self.args.script()} cannot learn from it, ppo_baseline can (docs/own_robot.md)"
+            )
         return self._env
 
     @cached_property

@@ -239,15 +239,17 @@ def serve(env: DiffEnv, policy: Callable[[Tensor], Tensor], caption: str, host: 
     stage, scene, name, due = Stage(), env.scene, env.task.name, 0.0
     motion = web.describe(scene, env.control_dt, env.task.ghost(env.memory) is not None)
     motion["live"] = next(text for kind, text in KEYS.items() if isinstance(env.task, kind)) + ALWAYS
-    try:
-        page = web.fill_page(motion, name, caption).encode()
-        server = Server((host, port), functools.partial(Handler, stage, page, scene.nbody, host))
-    except (OSError, OverflowError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise OSError(f"cannot listen on {host}:{port}: {why}; choose another --host or --port") from error
-    with server, suppress(KeyboardInterrupt):
+    page = web.fill_page(motion, name, caption).encode()
+    handler = functools.partial(Handler, stage, page, scene.nbody, host)
+    with Server((host, port), handler, bind_and_activate=False) as server, suppress(KeyboardInterrupt):
+        try:
+            server.server_bind()
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise OSError(f"cannot listen on {host}:{port}: {why}; choose another --host or --port") from error
         pilot = Pilot(env, policy)
-        pilot.step(Wish())  # compiles
+        pilot.step(Wish())  # compiles; a visitor before would only wait
+        server.server_activate()
         threading.Thread(target=server.serve_forever, daemon=True).start()
         print(f"http://{host}:{server.server_port} drives {name}; Ctrl-C ends it", flush=True)
         while True:  # pictures, each at its time

@@ -19,7 +19,8 @@ from diffsim_robots.imitation.kinematics import difference
 
 CONTROL_DT = 1 / 60  # s
 SHORTEST, LONGEST = 6, 216_000  # frames: 0.1 s and an hour
-LAYOUT = "an .npz file with finite qpos (frames, nq), in columns 3 to 6 the root's quaternion, and fps [1/s] or dt [s]"
+LAYOUT = "an .npz file with finite qpos (frames, nq), in columns 3 to 6 the root's quaternion, fps [1/s] or dt [s]"
+LAYOUT += ", and perhaps loop, True or False"
 ROWS = "a .csv file with finite rows of root position, quaternion xyzw and joints, without a header"
 RATE = 30.0  # 1/s of a .csv file that does not say: those of Unitree's LAFAN1
 BEYOND = math.radians(30)  # joint limits are springs, so that recorded motions pass them a little
@@ -147,8 +148,11 @@ def read_clip(source: str | Path) -> Clip:
 
 def _read_npz(path: Path, _: float) -> tuple[Tensor, float, bool]:
     with np.load(path, allow_pickle=False) as arrays:
-        qpos, loop = torch.from_numpy(arrays["qpos"].astype(np.float64)), bool(arrays.get("loop", True))
-        return qpos, float(arrays["dt"]) if "dt" in arrays else 1.0 / float(arrays["fps"]), loop
+        qpos, loop = arrays["qpos"], arrays.get("loop", np.array(True))
+        if qpos.dtype.kind not in "iuf" or loop.dtype.kind not in "biu" or loop not in (0, 1):  # texts, complex numbers
+            raise TypeError("numbers of another kind")
+        dt = float(arrays["dt"]) if "dt" in arrays else 1.0 / float(arrays["fps"])
+        return torch.from_numpy(qpos.astype(np.float64)), dt, bool(loop)
 
 
 def _read_csv(path: Path, fps: float) -> tuple[Tensor, float, bool]:
@@ -167,7 +171,9 @@ def _read_file(path: Path, fps: float) -> Clip:
             warnings.simplefilter("ignore")  # NumPy's, that a file is empty
             qpos, dt, loop = reader(path, fps)
         frames, norm = (len(qpos) - 1) * dt / CONTROL_DT, qpos[:, 3:7].norm(dim=1, keepdim=True)
-        if not (qpos.isfinite().all() and norm.min() >= 0.5 and SHORTEST - 1.5 <= frames <= LONGEST):
+        if not (
+            qpos.shape[1] >= 7 and qpos.isfinite().all() and norm.min() >= 0.5 and SHORTEST - 1.5 <= frames <= LONGEST
+        ):
             raise ValueError("numbers that are no motion")
     except (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, ArithmeticError, BadZipFile) as error:
         raise TaskError(f"clip {path} must be {layout}; of 0.1 s to 1 h") from error

@@ -29,7 +29,7 @@ def test_report_of_a_robot():
         "hopper: can be simulated",
         "  links      6 of one degree of freedom, base fixed",
         "  joints     4 hinge, 2 slide; 3 limited",
-        "  controls   3 motors, 0 muscles",
+        "  controls   3 motors",
         "  contact    6 points, ground at z = 0 m",
         "  - The robot's parts pass through each other: 3 pairs of geoms, such as 'torso_geom' and 'leg_geom'",
     ):
@@ -60,11 +60,11 @@ def test_command(tmp_path, capsys):
         (pendulum(rest='<actuator><motor name="m" joint="hinge"/></actuator>'), "actuators without ctrlrange: 'm'."),
         (
             standing("<freejoint/>", 'condim="4"'),
-            "Left out: torsional and rolling friction (condim 4 and 6; it is 3 here). MuJoCo's steps change by ",
+            "Left out: torsional and rolling friction (condim 4 and 6; it is 3 here). Without it a step's ",
         ),
         (
             standing('<joint type="free" frictionloss="1"/>'),
-            "Left out: frictionloss of a free joint (use <freejoint/>). MuJoCo's",
+            "Left out: frictionloss of a free joint (use <freejoint/>). Without it a step's change of velocity",
         ),
         (
             robot(
@@ -74,15 +74,21 @@ def test_command(tmp_path, capsys):
             "Left out, with their actuators: bodies that touch nothing, 'post'.",
         ),
         (pendulum(world='<body name="hand" mocap="true"/>'), "Mocap bodies stay where the file has them: 'hand'."),
-        (standing(option='noslip_iterations="9"'), "Left out: noslip_iterations. MuJoCo's steps change by "),
-        (standing(option='integrator="RK4"'), "Left out: integrator RK4, simulated as Euler. MuJoCo's"),
+        (
+            standing(option='noslip_iterations="9"'),
+            "Left out: noslip_iterations. Without it a step's ",
+        ),
+        (
+            standing(option='integrator="RK4"'),
+            "Left out: integrator RK4, simulated as Euler. Without it a step's change of velocity",
+        ),
         (
             standing(f"<freejoint/>{LINK}", option='integrator="implicit"'),
-            "Left out: integrator implicit, simulated as implicitfast. MuJoCo's",
+            "Left out: integrator implicit, simulated as implicitfast. Without it a step's change of velocity",
         ),
         (
             standing(option='solver="PGS" iterations="3"'),
-            "Left out: a solver that may stop before it converges. MuJoCo's steps change",
+            "Left out: a solver that may stop before it converges. Without it a step's",
         ),
         (
             standing(option='integrator="implicitfast" viscosity="1"'),
@@ -105,8 +111,8 @@ def test_command(tmp_path, capsys):
         ),
         (
             robot(
-                '<body><joint/><geom name="a" size="1" contype="0" conaffinity="0"/></body>'
-                '<body><joint/><geom name="b" size="1"/></body>',
+                '<body><joint/><geom name="a" size="1" contype="0" conaffinity="0"/>'
+                '<body><joint/><geom name="b" size="1"/></body></body>',
                 '<contact><pair geom1="b" geom2="a"/></contact>',
             ),
             "The robot's parts pass through each other: the geoms 'a' and 'b', would collide in MuJoCo.",
@@ -126,6 +132,16 @@ def test_command(tmp_path, capsys):
 )
 def test_approximations_are_told(mjcf, sentence):
     assert any(sentence in told for told in approximations(parse(mjcf)))
+
+
+def test_controls_and_timestep_are_named():
+    joints = "".join(f'<joint name="{axis}" type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    drives = '<motor joint="1 0 0"/><position joint="0 1 0" kp="3"/><velocity joint="0 0 1" kv="2"/>'
+    text = robot(f'<body>{joints}<geom size=".1"/></body>', f'<actuator>{drives}</actuator><option timestep="0"/>')
+    lines = report(parse(text)).splitlines()
+    assert "  controls   1 motors, 1 position servos, 1 velocity servos" in lines
+    assert any(line.startswith("  timestep   0 ms in the file, with which MuJoCo cannot step") for line in lines)
+    assert "  controls   none" in report(parse(pendulum())).splitlines()
 
 
 def test_a_robot_that_meets_nothing_is_not_approximated():

@@ -45,10 +45,11 @@ def test_a_checkpoint_names_no_code_to_run(words, tmp_path, monkeypatch, capsys)
     given = [*flags, "policy.pt"] if name != "export" else ["policy.pt", *flags]
     call = functools.partial(view.main, given) if name == "view" else functools.partial(command.main, [name, *given])
     assert refusal(call, capsys).endswith(
-        "of your own task: give its file, whose code runs, by --env task.py (drive: as robot)"
+        "of your own task, whose code runs only if you name its file: add --env task.py, or give drive the file in "
+        "place of the robot"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.pt", "task.py"]
-    with pytest.raises(ValueError, match="by --env task.py"):
+    with pytest.raises(ValueError, match="add --env task.py"):
         make_policy_env(load_policy("policy.pt"), 1)
     command.main(["export", "policy.pt", "alone.pt"])  # which needs no task
     assert not Path("ran").exists() and make_policy_env(load_policy("alone.pt"), 1, env="task.py").task.name == "own"

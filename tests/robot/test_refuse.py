@@ -95,6 +95,7 @@ REFUSED = {  # what the variants of test_variants.py have not
     "body 'fin': in a fluid each body needs a joint; merge its geoms": pendulum(
         inside=f'<body name="fin">{BALL}</body>', rest='<option density="1"/>'
     ),
+    "key 'home': qpos must be finite": pendulum(rest='<keyframe><key name="home" qpos="nan"/></keyframe>'),
     "body 'base': pos must be finite": robot(f'<body name="base" pos="nan 0 1"><freejoint/>{BALL}</body>'),
     "geom 'hull': fluidshape ellipsoid is not simulated": pendulum(
         inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'
@@ -210,6 +211,34 @@ def test_thousands_of_bodies_and_contact_points_are_read_in_seconds():
     assert parse(robot(f"<body><freejoint/>{geoms}</body>")).ncontact == 2000
     assert parse(robot(bodies)).nv == 1000
     assert time.perf_counter() - start < 30  # all pairs one by one took minutes
+
+
+@pytest.mark.parametrize("size", [1.0, 0.02], ids="links of {} m".format)
+def test_long_chains_are_simulated(size):
+    """Their mass matrices have small eigenvalues, though each joint moves a link."""
+    link = f'<body pos="{size} 0 0"><joint axis="0 1 0"/><geom pos="{size / 2} 0 0" size="{size / 5}"/>'
+
+    def chain(end):
+        return robot(link * 300 + end + "</body>" * 300, world="")
+
+    assert parse(chain("")).nv == 300
+    twice = f'<body><joint name="a"/><joint name="b"/><geom pos="{size} 0 0" size="{size / 5}"/></body>'
+    with pytest.raises(SceneError, match="joint 'a', 'b': they have a motion without inertia"):
+        parse(chain(twice))
+
+
+def test_what_looks_at_a_body_that_is_left_out_looks_ahead():
+    """A camera and a light of a goal that touches nothing, and of a part of it; others keep what they look at."""
+    looks = "".join(
+        f'<{kind} pos="2 0 1" mode="targetbody" target="{target}"/>'
+        for kind in ("camera", "light")
+        for target in ("goal", "part", "ball")
+    )
+    goal = '<body name="goal"><freejoint/><geom size=".1" contype="0" conaffinity="0"/><body name="part"/></body>'
+    scene = parse(robot(f'<body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/></body>{goal}{looks}'))
+    ball = scene.mj_model.body("ball").id
+    assert scene.left_out == ("goal",) and scene.mj_model.cam_targetbodyid.tolist() == [-1, -1, ball]
+    assert scene.mj_model.light_targetbodyid.tolist() == [-1, -1, ball]
 
 
 def test_all_obstacles_in_one_message():

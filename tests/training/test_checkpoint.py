@@ -100,6 +100,10 @@ def test_weights_are_compared_before_layers_are_built(tmp_path, capsys):
     ("places", "value", "message"),
     [
         ("args", [1], "is not a complete checkpoint"),
+        ("args", {"a": [{}]}, "is not a complete checkpoint"),
+        ("args env", None, "is not a complete checkpoint"),
+        ("args env", 10**12, "is not a complete checkpoint"),
+        ("script", 5, "is not a complete checkpoint"),
         ("script", "evil\x1b[31m", "is not a complete checkpoint"),
         ("iteration", "7\nERROR: fake line", "is not a complete checkpoint"),
         ("simulator", "\r", "is not a complete checkpoint"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import math
 import os
@@ -305,6 +306,27 @@ def test_a_lock_that_cannot_be_written_is_one_line(tmp_path, capsys):
     (tmp_path / "lock").mkdir()
     error = refusal(lambda: bptt.main([*TINY, "--iterations", "2", "--run-dir", str(tmp_path)]), capsys)
     assert error == f"script.py: cannot write to run directory {tmp_path}: Is a directory"
+
+
+REWARDS = {
+    "detached": lambda obs, action: obs[..., 0].detach() - 0.1 * action.square().sum(-1),
+    "jumps": lambda obs, action: (obs[..., 0] > 0).float() - 0.1 * action.square().sum(-1),
+    "rounded": lambda obs, action: (10 * obs[..., 0]).round(),
+    "integer": lambda obs, action: (obs[..., 0] > 0).long(),
+    "smooth": lambda obs, action: -obs[..., 0].square(),
+    "smooth in one place": lambda obs, action: obs[..., 1].clamp(min=0.02),
+}
+
+
+@pytest.mark.parametrize("kind", REWARDS)
+def test_a_reward_without_a_gradient_is_told_to_learners_that_need_one(kind, monkeypatch, capsys):
+    monkeypatch.setattr(CartPole, "reward", lambda self, obs, action: REWARDS[kind](obs, action))
+    for name in ("shac", "rpo", "bptt", "sapo", "ppo_baseline"):
+        args = parse(importlib.import_module(name).Args, [*TINY, "--num-envs", "8"])
+        Run(args).make_env(8, args.horizon)
+        told, needs = "".join(capsys.readouterr()), name != "ppo_baseline" and not kind.startswith("smooth")
+        assert ("the reward of cartpole has no gradient in the robot's state" in told) == needs, (name, told)
+        assert told.count("\n") == needs
 
 
 # What it counts -------------------------------------------------------------------------------------------------------

@@ -109,6 +109,6 @@ def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = Fa
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
         spheres=max(map(len, division.spheres)) if options.get("constrained") else 0,
         pairs=len(scene.pairs.kind) if scene.pairs else 0,
-        pair_sizes=scene.pairs.sizes if scene.pairs else PairSizes(),
+        pair_sizes=scene.constraints.pair_sizes if scene.constraints else PairSizes(),
         **options,
     )

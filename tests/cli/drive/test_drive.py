@@ -9,6 +9,7 @@ import json
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -251,6 +252,23 @@ def test_the_ant_turns_to_where_it_is_sent():
 def test_mistakes_are_one_line(arguments, message, stage, capsys):
     names = {"go2": str(command.shipped("go2")), "taken": stage[1]}
     assert message.format(**names) in refusal(lambda: command.main(arguments.format(**names).split()), capsys)
+
+
+def test_visitors_are_accepted_when_the_kernels_stand(monkeypatch):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def visit(self: Pilot, wish: Wish) -> dict[str, str]:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port), timeout=5)
+        visits.append(wish)
+        raise KeyboardInterrupt
+
+    visits = list[Wish]()
+    monkeypatch.setattr(Pilot, "step", visit)
+    drive.serve(diffsim.make("cartpole", 1, forces=True), lambda obs: torch.zeros(1, 1), "", "127.0.0.1", port)
+    assert len(visits) == 1
 
 
 def test_options_of_the_task_and_of_the_training_count(tmp_path, monkeypatch):

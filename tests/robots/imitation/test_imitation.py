@@ -118,6 +118,8 @@ NO_CLIPS = (  # another layout, in many ways; the last ones are no .npz files
     *({"qpos": GOOD, "fps": fps} for fps in (0, "fast", 1e-4)),
     *({"qpos": GOOD, "dt": dt} for dt in (-1.0, np.nan)),
     *({"qpos": qpos, "fps": 30} for qpos in (np.array([{}]), GOOD[:2], GOOD[:0], GOOD[0], GOOD * np.nan, GOOD * 0)),
+    *({"qpos": qpos, "fps": 30} for qpos in (GOOD[:, :5], GOOD.astype(str), GOOD + 1j)),
+    *({"qpos": GOOD, "fps": 30, "loop": loop} for loop in ("False", 0.5, 2, [True, False])),
     *({"qpos": GOOD}, {"fps": 30}, b"hello", b"", b"PK\x03\x04hello"),
 )
 WRONG_CLIPS = {
