@@ -71,7 +71,7 @@ TRADED = {"core seconds": ("core seconds", ".0f"), "return": ("return", ".0f")}
 TRADED |= {"at 4 x the substeps": ("return, finer", ".0f"), "in MuJoCo": ("return in MuJoCo", ".0f")}
 TRADED |= {"without a fall there": ("whole in MuJoCo", ".0%")}
 EXTREME = {"core seconds": "core seconds", "return": "return", "at 4 x the substeps": "return, finer"}
-EXTREME |= {"contained": "contained"}
+EXTREME |= {"updates skipped": "skipped", "contained": "contained"}
 ERRORS = {"state error (m, rad)": "state 0.5 s", "gradient error": "gradient 32", "cosine": "cosine 32"}
 
 
@@ -116,7 +116,8 @@ def measure(runner: Runner, case: Case) -> dict[str, object]:
         "return in MuJoCo": there.get("return", ""),
         "whole in MuJoCo": there.get("whole", ""),
         "norm of gradient": median(numbers(progress, "grad_norm")),
-        "contained": sum(numbers(progress, "sim_nonfinite") + numbers(progress, "sim_nonfinite_gradients")),
+        "skipped": numbers(progress, "grad_skipped")[-1],
+        "contained": sum(numbers(progress, f"sim_{name}")[-1] for name in ("nonfinite", "nonfinite_gradients")),
         "failed": "",
     }
 
@@ -151,7 +152,8 @@ def traded(rows: list[Cells]) -> list[Row]:
     lines = list[Row]()
     for (task,), own in grouped(rows, "task").items():
         settings = {name: each for (name,), each in grouped(own, "setting").items()}
-        best = front({name: (seconds(each), holds(each)) for name, each in settings.items()})
+        ended = {name: each for name, each in settings.items() if numbers(each, "return, finer")}
+        best = front({name: (seconds(each), holds(each)) for name, each in ended.items()})
         for name, each in settings.items():
             line = {"task": task, "setting": f"**{name}**" if name in best and seconds(each) > 0 else name}
             for title, (column, form) in TRADED.items():
@@ -161,12 +163,13 @@ def traded(rows: list[Cells]) -> list[Row]:
 
 
 def extreme(rows: list[Cells]) -> list[Row]:
-    """A line for each training: its returns, states and gradients that were contained, and what a failure printed."""
+    """A line for each training: its returns, updates that were skipped, states and gradients that were contained, and
+    the message of one that failed."""
     lines = list[Row]()
     for row in rows:
-        line: Row = {"task": row["task"], row["part"]: row["setting"]}
-        line = {**line, **{title: middle([row], column, ".0f") for title, column in EXTREME.items()}}
-        lines.append({**line, "failed": row["failed"]})
+        line = {"task": row["task"], row["part"]: row["setting"]}
+        line |= {title: middle([row], column, ".0f") for title, column in EXTREME.items()}
+        lines.append(line | ({"failed": row["failed"]} if any(each["failed"] for each in rows) else {}))
     return lines
 
 
@@ -185,6 +188,7 @@ def learned(rows: list[Cells]) -> list[Cells]:
     lines = list[Cells]()
     for (task,), own in grouped((row for row in rows if row["return, finer"]), "task").items():
         found = {integration(each[0]): each for each in grouped(own, "part", "setting").values()}
+        found = {how: each for how, each in found.items() if (task, named(how)) in errors}
         best = max(map(holds, found.values()))
         for how, each in sorted(found.items(), key=lambda item: item[0].substeps):
             error = errors[task, named(how)]
@@ -242,7 +246,7 @@ def main(args: Args) -> None:
             args.publish(f"trade {part}", markdown(shown), PAGE)
     if args.directory.name == "cpu":
         args.publish("trade gradients", markdown(learned(rows)), PAGE)
-        accuracy = [row for row in rows if row["part"] == "accuracy"]
+        accuracy = [row for row in rows if row["part"] == "accuracy" and row["return, finer"]]
         plot(args.picture("trade"), [[*panels(accuracy), gradient_panel(rows)]], (3.2, 2.8))
 
 

@@ -22,7 +22,14 @@ def row(setting: str, seed: int, seconds: float | str, finer: float, part: str =
         "core seconds": seconds,
         "return": finer + 1,
     }
-    cells |= {"return, finer": finer, "return in MuJoCo": "", "whole in MuJoCo": "", "contained": 0, "failed": ""}
+    cells |= {
+        "return, finer": finer,
+        "return in MuJoCo": "",
+        "whole in MuJoCo": "",
+        "skipped": 0,
+        "contained": 0,
+        "failed": "",
+    }
     return {name: str(value) for name, value in cells.items()}
 
 
@@ -56,10 +63,28 @@ def test_a_line_has_medians_and_the_front_is_bold() -> None:
 
 
 def test_errors_are_those_of_the_training_s_own_integration() -> None:
-    lines = trade.learned([row("default", 1, 9, 80), row("2", 1, 5, 40, "substeps"), row("shac, fast", 1, 1, 1)])
-    assert [line["substeps"] for line in lines] == ["2", "8 implicit"]  # rpo's ant
+    lines = trade.learned(
+        [
+            row("default", 1, 9, 80),
+            row("2", 1, 5, 40, "substeps"),
+            row("1", 1, 5, 90, "substeps"),
+            row("shac, fast", 1, 1, 1),
+        ]
+    )
+    assert [line["substeps"] for line in lines] == ["2", "8 implicit"]  # rpo's ant; the errors with 1 have no numbers
     assert [line["share of the best return"] for line in lines] == ["0.50", "1.00"]
     assert [line["gradient error"] for line in lines] == ["59.1", "0.299"]
+
+
+def test_an_extreme_is_a_line_with_what_was_skipped_and_contained() -> None:
+    rows = [row("1", 1, 5, 40, "substeps") | {"skipped": "7", "contained": "9"}]
+    (line,) = trade.extreme(rows)
+    assert line == {
+        **{"task": "ant", "substeps": "1", "core seconds": "5", "return": "41", "at 4 x the substeps": "40"},
+        **{"updates skipped": "7", "contained": "9"},
+    }
+    failed = {"core seconds": "", "return": "", "return, finer": "", "skipped": "", "contained": "", "failed": "no"}
+    assert [line["failed"] for line in trade.extreme([*rows, rows[0] | failed])] == ["", "no"]
 
 
 def test_costs_are_shares_of_the_best_too() -> None:
@@ -90,5 +115,6 @@ def test_a_row_has_seconds_of_the_training_alone_and_returns_of_many_episodes(
     assert found == again  # nothing is trained or evaluated twice
     assert found["core seconds"] == float((case.folder / "core_seconds.txt").read_text())
     assert found["control steps"] == 16 and found["substeps"] == 4 and found["failed"] == ""
+    assert (found["skipped"], found["contained"]) == (0, 0)
     assert found["return"] < 0 > found["return, finer"] and math.isfinite(found["return in MuJoCo"])
     assert found["whole in MuJoCo"] == 1.0
