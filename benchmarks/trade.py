@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from cells import Case, Runner, ScriptFlags, evaluation
 from common import LEARNT, RESULTS, Line, Panel, Tasks, load_case, plot, run
@@ -30,10 +30,10 @@ from transfer import in_mujoco
 
 import rpo
 from diffsim.sim.integration import Integration
-from diffsim.tasks import find_task
+from diffsim.tasks import FILE, find_task
 from diffsim.training.evaluation import kept
 
-PartName = Literal["accuracy", "contact", "substeps", "horizon"]
+PartName = Literal["accuracy", "contact", "substeps", "horizon", "scene"]
 ONCE = "--threads 1 --eval-every 0 --save-every 0 --eval-episodes 1"  # of all trainings
 EPISODES = 64  # on which a policy is judged
 KEY = ("part", "task", "setting", "seed")
@@ -64,6 +64,10 @@ PARTS: dict[PartName, Part] = {
         {str(h): flags for h, flags in HORIZONS.items()}
         | {f"{h}, clipped": f"{flags} --adjoint-clip 5" for h, flags in HORIZONS.items()},
     ),
+    "scene": Part(
+        {"half_cheetah": "rpo"},
+        {"without limits": "--env benchmarks/scenes.py:Unlimited", "with drag": "--env benchmarks/scenes.py:Dragged"},
+    ),
 }
 
 # Columns of the tables: their titles, those of the csv files and their form.
@@ -80,7 +84,7 @@ class Args(ScriptFlags):
     env: Tasks = ("cartpole", "half_cheetah", "hopper", "ant")
     device: str = "cpu"  # torch device of the runs
     runs: Path = ScriptFlags.runs.parent / "trade"  # directory of the runs
-    parts: tuple[PartName, ...] = ("accuracy", "contact", "substeps", "horizon")  # questions
+    parts: tuple[PartName, ...] = get_args(PartName)  # questions
     settings: tuple[str, ...] = ()  # of a part, such as fast (default: all)
     seeds: tuple[int, ...] = (1, 2, 3)  # seeds, each of all before the next one
 
@@ -94,7 +98,9 @@ def cases(args: Args) -> Iterator[tuple[dict[str, object], Case]]:
             if name in (args.settings or (name,)):
                 folder = args.runs / part / re.sub(r"\W+", "_", f"{task}__{name}") / str(seed)
                 about = {"part": part, "task": task, "setting": name, "seed": seed}
-                yield about, Case(folder, task, seed, script, (*ONCE.split(), *settings[setting].split()))
+                flags = settings[setting].split()
+                env, flags = (flags[1], flags[2:]) if flags[:1] == ["--env"] else (task, flags)
+                yield about, Case(folder, env, seed, script, (*ONCE.split(), *flags))
 
 
 def measure(runner: Runner, case: Case) -> dict[str, object]:
@@ -103,10 +109,10 @@ def measure(runner: Runner, case: Case) -> dict[str, object]:
     if not runner.train(case):
         said = output.read_text().splitlines() if output.is_file() else []
         return {"failed": said[-1]} if said and "stopped early" not in said[-1] else {}
-    if not runner.evaluate(case, "judged", "--eval-episodes", EPISODES):
+    if not runner.evaluate(case, "judged", "--env", case.env, "--eval-episodes", EPISODES):
         return {}
     found, progress = evaluation(case.folder / "judged"), read_csv(case.folder / "progress.csv")
-    there = in_mujoco(load_case(case.folder, EPISODES, "cpu"))
+    there = {} if FILE.fullmatch(case.env) else in_mujoco(load_case(case.folder, EPISODES, "cpu"))
     return {
         "substeps": found["settings"]["substeps"],
         "control steps": int(progress[-1]["control_steps"]),
