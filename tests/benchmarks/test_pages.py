@@ -13,12 +13,12 @@ from learners import refusal
 
 from diffsim.training.checkpoint import POLICIES
 
-MADE = "gradients", "joystick", "numerics", "overview", "suites", "trade", "tracking", "transfer", "guided_policy_search"
+MADE = "gradients", "joystick", "numerics", "overview", "suites", "tracking", "transfer", "guided_policy_search"
 CASES = [
     *((name, {}) for name in MADE),
     *((name, {"race": True}) for name in ("joystick", "tracking")),
     ("pairs", {}),
-    ("trade", {"output": common.RESULTS / "h200"}),
+    *(("trade", {"output": common.RESULTS / machine}) for machine in ("cpu", "h200")),
     ("speed", {"parts": ("iteration",), "output": common.RESULTS / "h100"}),
 ]
 
