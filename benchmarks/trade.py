@@ -38,6 +38,7 @@ ONCE = "--threads 1 --eval-every 0 --save-every 0 --eval-episodes 1"  # of all t
 EPISODES = 64  # on which a policy is judged
 KEY = ("part", "task", "setting", "seed")
 PAGE = "numerics.md"
+FASTER, AS_HIGH = 0.9, 0.99  # shares of the seconds and of the return: what beats a setting
 
 
 class Part(NamedTuple):
@@ -76,6 +77,7 @@ TRADED |= {"at 4 x the substeps": ("return, finer", ".0f"), "in MuJoCo": ("retur
 TRADED |= {"without a fall there": ("whole in MuJoCo", ".0%")}
 EXTREME = {"core seconds": "core seconds", "return": "return", "at 4 x the substeps": "return, finer"}
 EXTREME |= {"updates skipped": "skipped", "contained": "contained"}
+SHARE = "share of the best return"
 ERRORS = {"state error (m, rad)": "state 0.5 s", "gradient error": "gradient 32", "cosine": "cosine 32"}
 
 
@@ -149,8 +151,12 @@ def holds(rows: list[Cells]) -> float:
 
 
 def front(points: Mapping[str, tuple[float, float]]) -> set[str]:
-    """Those seconds and returns to which none of less seconds has a return as high."""
-    return {name for name, (x, y) in points.items() if not any(a < x and b >= y for a, b in points.values())}
+    """Those seconds and returns that no others beat: by a tenth of the seconds, with a return as high to 1 %."""
+
+    def beaten(x: float, y: float) -> bool:
+        return any(a < FASTER * x and kept(y, b) >= AS_HIGH for a, b in points.values())
+
+    return {name for name, point in points.items() if not beaten(*point)}
 
 
 def traded(rows: list[Cells]) -> list[Row]:
@@ -201,34 +207,39 @@ def learned(rows: list[Cells]) -> list[Cells]:
             line = {"task": task, "substeps": f"{how.substeps}{' implicit' * how.implicit}"}
             line |= {"core seconds": middle(each, "core seconds", ".0f")}
             line |= {title: error[column] for title, column in ERRORS.items()}
-            lines.append(line | {"share of the best return": f"{kept(best, holds(each)):.2f}"})
+            lines.append(line | {SHARE: f"{kept(best, holds(each)):.2f}"})
     return lines
 
 
 def panels(rows: list[Cells]) -> Iterator[Panel]:
-    """Seconds against the return that holds, of each task: all seeds as a line, their median as a point."""
+    """Seconds against the share of the best return that holds, of each task: medians as points, all seeds as a line."""
     styles = {name: f"C{k}" for k, name in enumerate(PARTS["accuracy"].settings)}
     for (task,), own in grouped(rows, "task").items():
         lines, points = list[Line](), dict[str, tuple[float, float]]()
-        for (name,), each in grouped(own, "setting").items():
+        settings = grouped(own, "part", "setting")
+        best = max(map(holds, settings.values()))
+        for (part, name), each in settings.items():
             learner, _, setting = name.rpartition(", ")
-            colour, label = styles[setting], f"{learner or 'rpo'}, {setting}"
-            points[name] = x, middle = seconds(each), holds(each)
-            y = numbers(each, "return, finer")
-            lines.append(Line([x, x], [min(y), max(y)], f"{colour}-"))
-            lines.append(Line([x], [middle], f"{colour}{'s' if learner else 'o'}", label))
-        best = sorted(points[name] for name in front(points))
-        through = Line([x for x, _ in best], [y for _, y in best], "k:", "front", 0.8)
-        yield Panel([through, *lines], task, "core seconds of training", "return at 4 x the substeps", "x")
+            style = f"{styles.get(setting, 'k')}{'s' if learner else 'o' if part == 'accuracy' else 'x'}"
+            label = f"{learner or 'rpo'}, {setting if part == 'accuracy' else 'fewer substeps'}"
+            shares = [kept(best, value) for value in numbers(each, "return, finer")]
+            point = seconds(each), kept(best, holds(each))
+            points |= {name: point} if part == "accuracy" else {}
+            lines.append(Line([point[0]] * 2, [min(shares), max(shares)], f"{style[:-1]}-"))
+            lines.append(Line([point[0]], [point[1]], style, label))
+        through, ends = sorted(points[name] for name in front(points)), [line.x[0] for line in lines]
+        lines.append(Line([x for x, _ in through], [y for _, y in through], "k:", "front", 0.8))
+        lines.append(Line([min(ends), max(ends)], [0, 0], "k-", width=0.5))
+        yield Panel(lines, task, "core seconds of training", SHARE)
 
 
 def gradient_panel(rows: list[Cells]) -> Panel:
     """The error of the gradient against the return that holds, a line for each task."""
     lines = list[Line]()
     for k, ((task,), own) in enumerate(grouped(learned(rows), "task").items()):
-        x, y = numbers(own, "gradient error"), numbers(own, "share of the best return")
+        x, y = numbers(own, "gradient error"), numbers(own, SHARE)
         lines.append(Line(x, y, f"C{k + 3}o-", task, 0.8))
-    return Panel(lines, "all tasks", "error of the gradient over 32 steps", "share of the best return", "x")
+    return Panel(lines, "all tasks", "error of the gradient over 32 steps", SHARE, "x")
 
 
 def place(row: Cells) -> tuple[int, bool, int]:
@@ -252,8 +263,8 @@ def main(args: Args) -> None:
             args.publish(f"trade {part}", markdown(shown), PAGE)
     if args.directory.name == "cpu":
         args.publish("trade gradients", markdown(learned(rows)), PAGE)
-        accuracy = [row for row in rows if row["part"] == "accuracy" and row["return, finer"]]
-        plot(args.picture("trade"), [[*panels(accuracy), gradient_panel(rows)]], (3.2, 2.8))
+        drawn = [row for row in rows if row["part"] in ("accuracy", "substeps") and row["return, finer"]]
+        plot(args.picture("trade"), [[*panels(drawn), gradient_panel(rows)]], (3.2, 2.8))
 
 
 if __name__ == "__main__":

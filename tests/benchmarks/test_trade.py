@@ -46,8 +46,11 @@ def test_each_training_is_a_command_with_a_folder_of_its_own() -> None:
 
 
 def test_the_front_has_what_nothing_faster_is_as_good_as() -> None:
-    points = {"fast": (1.0, 10.0), "slow, worse": (2.0, 9.0), "as good": (3.0, 10.0), "best": (4.0, 11.0)}
-    assert trade.front(points) == {"fast", "best"}
+    points = {"fast": (10.0, 100.0), "slow, worse": (20.0, 90.0), "as good": (30.0, 100.9), "best": (40.0, 110.0)}
+    points["hardly slower, worse"] = (11.0, 90.0)
+    assert trade.front(points) == {"fast", "best", "hardly slower, worse"}
+    costs = {name: (x, -1e4 / y) for name, (x, y) in points.items()}
+    assert trade.front(costs) == {"fast", "best", "hardly slower, worse"}
 
 
 def test_a_line_has_medians_and_the_front_is_bold() -> None:
