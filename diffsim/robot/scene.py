@@ -148,6 +148,16 @@ class Scene:
         return self.constraints.pairs if self.constraints else None
 
     @property
+    def has_trees(self) -> bool:
+        """Tell whether each tree has an origin of its own: beside free bodies, or what the robot touches or is tied to.
+
+        Muscles may join two trees, which then share the world's.
+        """
+        free = mujoco.mjtJoint.mjJNT_FREE in self.mj_model.jnt_type
+        apart = not self.floating and self.carrier == 0 and not len(self.segment_muscle)
+        return apart and (free or self.pairs is not None)
+
+    @property
     def qpos_adr(self) -> Index:
         """Return the index in qpos (nlink,) of each link's joint, w, x and y of its quaternion for a ball joint."""
         passed = np.concatenate([[0], np.cumsum(self.ball == 2)[:-1]])  # balls, each one number longer than its rates
@@ -174,6 +184,7 @@ class Scene:
         damped, servos = bool(self.damping.any() or self.base_damping.any()), bool(self.servo_damping.any())
         present = {
             "floating": self.floating,
+            "trees": self.has_trees,
             "hinge": bool((~self.slide & (self.ball < 0))[1:].any()),
             "slide": bool(self.slide[1:].any()),
             "ball": self.nball > 0,
@@ -214,6 +225,20 @@ class Scene:
                 break
             link += 1
         return link
+
+    @property
+    def moves_origin(self) -> Index:
+        """Mark links (nlink,) that carry the origin of their tree's spatial vectors, beside other trees: its root.
+
+        Of massless slides in a row, such as a free joint's, all do. So no digits are lost far from the world's origin.
+        """
+        marks = np.zeros(self.nlink, np.int32)
+        busy = np.isin(range(self.nlink), [*self.contact_link, *(self.pairs.link.flat if self.pairs else [])])
+        busy |= (self.mass > 0) | (np.bincount(self.parent[1:], minlength=self.nlink) > 1)
+        for link, parent in enumerate(self.parent.tolist()):
+            passed = self.slide[link] and self.slide[parent] and not busy[parent]
+            marks[link] = link > 0 and (parent == 0 or (marks[parent] and passed))
+        return marks
 
     @property
     def root(self) -> RootCoordinates:
