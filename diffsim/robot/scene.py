@@ -149,13 +149,9 @@ class Scene:
 
     @property
     def has_trees(self) -> bool:
-        """Tell whether each tree has an origin of its own: beside free bodies, or what the robot touches or is tied to.
-
-        Muscles may join two trees, which then share the world's.
-        """
+        """Tell whether each tree has an origin of its own: beside free bodies, or what it touches or is tied to."""
         free = mujoco.mjtJoint.mjJNT_FREE in self.mj_model.jnt_type
-        apart = not self.floating and self.carrier == 0 and not len(self.segment_muscle)
-        return apart and (free or self.pairs is not None)
+        return not self.floating and self.carrier == 0 and (free or self.pairs is not None)
 
     @property
     def qpos_adr(self) -> Index:
@@ -185,6 +181,7 @@ class Scene:
         present = {
             "floating": self.floating,
             "trees": self.has_trees,
+            "gyroscopic": len(self.free_bodies) > 0,
             "hinge": bool((~self.slide & (self.ball < 0))[1:].any()),
             "slide": bool(self.slide[1:].any()),
             "ball": self.nball > 0,
@@ -225,6 +222,33 @@ class Scene:
                 break
             link += 1
         return link
+
+    @property
+    def free_bodies(self) -> Index:
+        """Return the links of free bodies without joints, whose spin MuJoCo's implicitfast integrates implicitly.
+
+        That changes nothing of a ball, whose inertia is the same about all axes, unless that is a parameter.
+        """
+        m, links = self.mj_model, list[int]()
+        if self.constraints is None or takes_euler(m):
+            return np.zeros(0, np.int32)
+        sizes = np.bincount(m.dof_treeid, minlength=m.ntree)
+        for dof in m.jnt_dofadr[m.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist():
+            link = 0 if self.floating else dof + 6
+            round_ = np.ptp(np.linalg.eigvalsh(self.inertia[link])) < 1e-9 * self.inertia[link].max()
+            round_ &= abs(self.com[link]).max() < 1e-9
+            if sizes[m.dof_treeid[dof]] == 6 and (self.parameters or not round_):
+                links.append(link)
+        return np.array(links, np.int32)
+
+    @property
+    def indivisible(self) -> str:
+        """Name what keeps threads of a GPU from sharing an environment, if anything does."""
+        if self.pairs:
+            return "rows between two bodies"
+        if self.transmissions:
+            return "actuators on fixed tendons or at sites"
+        return "free bodies with implicitfast" if len(self.free_bodies) else ""
 
     @property
     def moves_origin(self) -> Index:

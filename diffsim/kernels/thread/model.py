@@ -161,6 +161,7 @@ FIELDS: dict[str, Field] = {
     "motor_slot": ("ints", lambda n: n.motor_slot.flatten()),  # (lane, motor), 0 if the motor's link is on another lane
     "motor_lane": ("ints", lambda n: n.motor_lane),  # the lane that writes the motor's gradient
     **_scenes("reals", "gear motor_bias"),  # force of an actuator: gear ctrl + motor_bias
+    "free_body": ("ints", lambda n: n.slot[0, n.scene.free_bodies]),  # the links of gyroscope.py
     # Muscles: a segment runs from point a of link pair_link[2 k] to point b of link pair_link[2 k + 1]
     "muscle_begin": ("ints", lambda n: np.cumsum([0, *map(len, n.division.muscles)])),  # of each lane, in muscle
     "muscle": ("ints", lambda n: sum(n.division.muscles, [])),  # actuators that are muscles, by lane
