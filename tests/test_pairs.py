@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import test_constraint
 import torch
-from scenes import free_states, parse, pendulum, random_tree, robot, unit
+from scenes import FLOOR, free_states, parse, pendulum, random_tree, robot, unit
 from test_constraint import CONES, STATES, H, check_gradients, in_mujoco, mujoco_model, step
 from test_gradient import gradients, weights
 
@@ -22,6 +22,7 @@ from diffsim.robot.pairs import with_pairs
 from diffsim.robot.scene import FACTORS
 from diffsim.robot.shapes import as_primitives
 from diffsim.robot.types import SceneError
+from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim_cli.report import approximations, report
@@ -236,6 +237,31 @@ def test_a_four_bar_linkage_turns_as_in_mujoco(rng):
     np.testing.assert_allclose(qpos, expected, atol=1e-8)
     np.testing.assert_allclose(qvel, velocity, atol=1e-6)
     np.testing.assert_allclose(qpos[:, 3], qpos[:, 4], atol=1e-3)
+
+
+@pytest.mark.unoptimized
+def test_tendons_pull_between_trees_far_from_the_origin(rng):
+    """Motors on tendons from the world to an arm and a free body."""
+    tendons = "".join(
+        f'<spatial name="{name}"> {"".join(f"<site site={site!r}/>" for site in sites)} </spatial>'
+        for name, sites in (("long", "wab"), ("short", "bw"))
+    )
+    scene = parse(f"""
+    <mujoco> <worldbody> <site name="w" pos="80 -9 1.5"/>
+      <body pos="80 -9 1"> <joint axis="0 1 0" damping=".1"/> <site name="a" pos=".3 0 .02"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" contype="0" conaffinity="0"/> </body>
+      <body pos="80.5 -9 1"> <freejoint/> <geom type="box" size=".1 .05 .03"/> <site name="b" pos=".05 0 .03"/> </body>
+    </worldbody> <tendon> {tendons} </tendon>
+    <actuator> <motor tendon="long" gear="-3" ctrlrange="0 1"/> <motor tendon="short" gear="-2" ctrlrange="0 1"/>
+    </actuator> </mujoco>""")
+    qpos, qvel = scene.qpos0 + 0.05 * rng.normal(size=(12, scene.nq)), 0.5 * rng.normal(size=(12, scene.nv))
+    states = [x.astype(np.float32).astype(float) for x in (qpos, qvel, rng.uniform(-1, 1, (12, scene.nu)))]
+    expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+    change = abs(expected - states[1]).max(1)
+    for dtype, tolerance, enough in ((torch.float64, 1e-12, 1e-10), (torch.float32, 1e-4, 1e-3)):
+        found = step(scene, states, tolerance=tolerance, dtype=dtype)[1]
+        assert (abs(found - expected).max(1) / change).max() < enough
+    check_gradients(scene, [x[:6] for x in states], rng)
 
 
 @SLOW
@@ -632,6 +658,43 @@ def test_capsules_that_a_turned_body_makes_parallel_touch_twice(where, rng):
     expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
     change = abs(expected - states[1]).max(1)
     np.testing.assert_array_less(abs(step(scene, states)[1] - expected).max(1), 1e-6 * change)
+
+
+def slippery(boxes, friction, option=""):
+    """A pile of boxes, of which the third is turned and heavy."""
+    bodies = "".join(
+        f'<body pos="{0.02 * k} 0 {0.199 * k + 0.098}" euler="0 0 {20 * (k == 2)}"> <freejoint/>'
+        f'<geom type="box" size=".1 .1 .1" friction="{friction}" density="{1000 + 4000 * (k == 2)}"/> </body>'
+        for k in range(boxes)
+    )
+    return parse(f"<mujoco> {option} <worldbody> {FLOOR} {bodies} </worldbody> </mujoco>")
+
+
+@needs_manifolds
+@pytest.mark.unoptimized
+@pytest.mark.parametrize("boxes", [2, 3])
+def test_slippery_boxes_slide_as_in_mujoco(boxes, rng, monkeypatch):
+    """With pyramids, whose normals are the stiffer the less friction there is, and within 30 passes."""
+    monkeypatch.setattr(simulator, "PASSES", 30)
+    for friction, option in ((0.02, ""), (0.05, ""), (0.02, '<option gravity="3 1 -9.81" impratio="5"/>'), (0.002, "")):
+        scene = slippery(boxes, friction, option)
+        states = np.tile(scene.qpos0, (32, 1)), 0.1 * rng.normal(size=(32, scene.nv)), np.zeros((32, 0))
+        states = [x.astype(np.float32).astype(float) for x in states]
+        expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+        change = abs(expected - states[1]).max(1)
+        for dtype, tolerance, enough in ((torch.float64, 1e-12, 1e-8), (torch.float32, 1e-4, 3e-3)):
+            if dtype == torch.float64 or (friction > 0.01 and not option):
+                _, found, residual = step(scene, states, tolerance=tolerance, dtype=dtype)
+                assert residual.max() < tolerance
+                assert (abs(found - expected).max(1) / change).max() < enough, (friction, dtype)
+
+
+@needs_manifolds
+@pytest.mark.unoptimized
+def test_gradient_of_slippery_boxes_is_that_of_differences(rng):
+    scene = slippery(2, 0.01)
+    qpos = scene.qpos0 + 0.003 * rng.normal(size=(6, scene.nq))  # without edges on each other
+    check_gradients(scene, (qpos, 0.1 * rng.normal(size=(6, scene.nv)), np.zeros((6, 0))), rng)
 
 
 @needs_manifolds
