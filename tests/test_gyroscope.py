@@ -18,7 +18,7 @@ from diffsim.robot.scene import FACTORS, Scene
 enough_passes = test_constraint.enough_passes
 pytestmark = [
     pytest.mark.unoptimized,
-    pytest.mark.skipif(VERSION < (4, 0), reason="MuJoCo before 3.14 leaves bodies with fixed children out"),
+    pytest.mark.skipif(VERSION < (4, 0), reason="MuJoCo before 4 has another implicitfast of free bodies"),
 ]
 HAMMER = """{joint} <geom type="box" size=".2 .1 .02" pos=".05 0 .02" density="300"/>
     <body pos="0 .1 0" euler="20 30 0"> <geom type="capsule" size=".02 .1" density="800"/> </body>"""

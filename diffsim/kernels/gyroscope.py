@@ -1,4 +1,4 @@
-"""Gyroscopic forces of free bodies, implicit in the velocity, as MuJoCo's implicitfast has them since 3.10.
+"""Gyroscopic forces of free bodies, implicit in the velocity, as those of MuJoCo 4's implicitfast.
 
 After the constraints' acceleration a, damping b and these forces act on the velocity at the end of the step, so that
 its acceleration x satisfies the six equations of a body without joints

@@ -23,7 +23,6 @@ from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
-from diffsim.kernels.tree.kinematics import kinematics
 
 
 @cache
@@ -33,7 +32,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, vec4, Model, Lane, Link = t.T, t.vec3, t.vec4, t.Model, t.Lane, t.Link
     Node, Adjoint = t.Node, t.Adjoint
     CarrierPos, force_at, point_velocity, pick = t.CarrierPos, sp.force_at, sp.point_velocity, block.pick
-    ground, TERRAIN, above_ground = terrain_contact(spec), "terrain" in spec.features, kinematics(spec).above_ground
+    ground, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, in_frame, in_world = spec.implicit, ground.in_frame, ground.in_world
 
     @wp.func
@@ -46,7 +45,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         """
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         r = T(m.contact_radius[c])
-        depth, E, curvature = ground.distance(m, here, c, above_ground(link, centre), carrier, r)
+        depth, E, curvature = ground.distance(m, here, c, ground.about_carrier(link, centre), carrier, r)
         p = centre - in_world(E, vec3(T(0.0), T(0.0), r))
         v = in_frame(E, point_velocity(link.V, p))
         return p, v, depth, E, curvature

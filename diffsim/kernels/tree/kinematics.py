@@ -72,13 +72,6 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                     links[i + k].q = r[k]
 
     @wp.func
-    def above_ground(link: t.Link, p: vec3):
-        """Return a point of a link about the carrier."""
-        if wp.static(TREES):
-            return link.origin + p
-        return p
-
-    @wp.func
     def carrier_position(m: Model, x: T, z: T):
         """Return the position of a floating base at x and z, or of a fixed base (x = z = 0), to which slides add."""
         if wp.static(TERRAIN):
