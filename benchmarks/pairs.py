@@ -34,7 +34,7 @@ from tables import Row
 
 from diffsim import Integration, Scene, Simulator, load_scene
 from diffsim.kernels.pairs.adjoint import ACCURACY_ADJOINT
-from diffsim.kernels.pairs.rows import ACCURACY
+from diffsim.kernels.pairs.rows import ACCURACY, LOOSE
 from diffsim.kernels.pairs.solver import ROUND_OFF
 from diffsim.robot.elements import control_range
 from diffsim.robot.pairs import with_pairs
@@ -176,7 +176,7 @@ def statistics(m: mujoco.MjModel, data: mujoco.MjData, qacc: Array) -> dict[str,
     """Repeat the steps between iterates (passes, nv) after mj_forward without a warm start; nothing if they differ."""
     last, steps = np.zeros(m.nv), list[int]()
     for k, following in enumerate(qacc):
-        step, count = conjugate_gradients(linearize(m, data, last, k == 0), ACCURACY)
+        step, count = conjugate_gradients(linearize(m, data, last, k == 0), ACCURACY * 0.1 ** max(k + 1 - LOOSE, 0))
         length = (following - last) @ step / (step @ step)  # by the line search
         if np.linalg.norm(following - last - length * step) > AGREE * (1 + np.linalg.norm(following)):
             return {}

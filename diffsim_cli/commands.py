@@ -30,6 +30,7 @@ from diffsim.training.errors import in_one_line
 from diffsim_cli import render
 from diffsim_cli.export import export_onnx, export_policy
 from diffsim_cli.report import report as report_robot
+from diffsim_cli.report import steps_beside_mujoco
 from diffsim_cli.tune import tune
 from diffsim_cli.view import main as film
 from diffsim_cli.watch import film_median, make_policy_env
@@ -171,6 +172,8 @@ def check(robot: Positional[Path], contact: Contact = "mujoco") -> None:
         scene = load_scene(robot)
         check_soft(scene) if contact == "soft" else constrained(scene, 1e-3)
         print(report_robot(scene))
+        if contact == "mujoco" and 0 < scene.mj_model.opt.timestep < float("inf"):
+            print(f"\n{steps_beside_mujoco(scene)}")
     except SceneError as error:
         print(f"Cannot be simulated.\n\n{error}")
         sys.exit(1)

@@ -2,8 +2,8 @@
 
     python ppo_baseline.py --env examples/push.py --iterations 200
 
-PPO solves it. The learners that use the gradient do not: while nothing touches, and while a force is too small to slide
-the box, the box does not depend on the action.
+PPO solves it, and RPO nearly as well, though the gradient says little: while nothing touches, and while a force is too
+small to slide the box, the box does not depend on the action.
 """
 
 import mujoco

@@ -31,7 +31,7 @@ class RandomScene:
         for tree in range(one_of([1, 1, 1, 2, 2, 3])):
             root = one_of(["free", "free", "joint"]) if free or tree else one_of(["free", "joint", "fixed"])
             joints = one_of([0, 0, 1, 2, 3] if tree else [1, 2, 3, 4, 6, 8, 11])
-            self.left = max(joints, 1) if root != "free" or self.implicit else joints
+            self.left = joints if root == "free" else max(joints, 1)
             world += self.body(root, words(between(-0.1, 0.1) + 0.22 * tree, between(-0.1, 0.1), between(0.1, 0.4)), 0)
         contact, equality = self.contact(), self.equality()
         tendons, actuators = self.drives()
@@ -169,7 +169,7 @@ class RandomScene:
         for _ in range(one_of([1, 1, 2, 2, 3]) if depth < 6 else 0):
             if self.left > 0:
                 at = words(*(self.numbers.choice([-1, 1]) * self.numbers.uniform(0.08, 0.2) for _ in range(3)))
-                welded = not often(0.9) and not (self.implicit and depth == 0)
+                welded = not often(0.9)
                 text += self.body("welded" if welded else "joint", at, depth + 1)
         more = one_of(["", f'quat="{self.quaternion()}"', 'euler="10 50 -20"'])
         more += self.maybe(0.06, f'gravcomp="{self.some(0.2, 1.5)}"')

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import test_constraint
 import torch
-from scenes import free_states, parse, pendulum, random_tree, robot
+from scenes import FLOOR, free_states, parse, pendulum, random_tree, robot, unit
 from test_constraint import CONES, STATES, H, check_gradients, in_mujoco, mujoco_model, step
+from test_gradient import gradients, weights
 
 from diffsim.robot import types
 from diffsim.robot.constants import constrained
@@ -21,6 +22,7 @@ from diffsim.robot.pairs import first_contacts, room_of, with_pairs
 from diffsim.robot.scene import FACTORS
 from diffsim.robot.shapes import as_primitives
 from diffsim.robot.types import SceneError
+from diffsim.sim import simulator
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim_cli.report import approximations, report
@@ -94,6 +96,110 @@ def test_tree_gradient_is_that_of_differences(base, rng):
     check_gradients(scene, [x[calm] for x in states], rng)
 
 
+HALF_TURN = """
+<mujoco> <worldbody>
+  <body name="a" pos="0 0 1"> <joint axis="0 1 0" damping=".1"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" contype="0" conaffinity="0"/> </body>
+  <body name="b" pos=".4 0 1"> <freejoint/> <geom type="box" size=".05 .03 .02" contype="0" conaffinity="0"/> </body>
+</worldbody>
+<equality> <weld body1="a" body2="b" relpose=".4 0 0 1 0 0 0" torquescale=".7"/> </equality> </mujoco>"""
+
+
+def half_turns(number, rng, beside):
+    """States with the bodies of the weld turned against each other by pi - beside, about axes of all directions."""
+    scene = parse(HALF_TURN)
+    axes = unit(np.concatenate([np.eye(3), rng.normal(size=(number - 3, 3))]))
+    turns = 0.5 * (np.pi - beside) * np.ones((number, 1))
+    qpos = np.column_stack(
+        [np.zeros(number), np.tile([0.4, 0, 1], (number, 1)), np.cos(turns), np.sin(turns) * axes]
+    ).astype(np.float32)
+    return scene, (
+        qpos.astype(float),
+        rng.normal(size=(number, scene.nv)).astype(np.float32) * 0.1,
+        np.zeros((number, 0)),
+    )
+
+
+@needs_drift
+@pytest.mark.unoptimized
+@pytest.mark.parametrize("dtype, enough", [(torch.float64, 1e-10), (torch.float32, 1e-3)])
+def test_a_weld_turned_by_half_a_turn_pulls_as_in_mujoco(dtype, enough, rng):
+    tolerance = {} if dtype == torch.float64 else {"tolerance": 1e-4}
+    for beside in (0.0, 1e-9, 1e-7, -1e-6, 1e-5, -1e-4, 1e-3, 1e-2):
+        scene, states = half_turns(16, rng, beside)
+        expected = in_mujoco(scene, *states)[1]
+        change = abs(expected - states[1]).max(1)
+        found = step(scene, states, dtype=dtype, **tolerance)[1]
+        assert (abs(found - expected).max(1) / change).max() < enough
+
+
+@pytest.mark.unoptimized
+def test_gradient_of_a_weld_turned_by_half_a_turn_is_that_of_differences(rng):
+    """Also in float32, in which it is near that of float64."""
+    for beside in (0.0, 1e-6):
+        scene, states = half_turns(6, rng, beside)
+        check_gradients(scene, states, rng)
+        check_single_precision(scene, states, rng)
+
+
+def check_single_precision(scene, states, rng):
+    """Compare gradients of float32 with those of float64."""
+    w = weights(scene, rng)
+    exact, rounded = (
+        gradients(
+            scene, states, w, integration=Integration("mujoco", 2, tolerance=tolerance), control_dt=2 * H, dtype=dtype
+        )
+        for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-4))
+    )
+    for one, other in zip(exact, rounded, strict=True):
+        assert np.linalg.norm(one - other) <= 1e-3 * np.linalg.norm(one)
+
+
+# An arm and a box on a fixed box, which it pushes, a ball tied to the arm, a bar welded to the world and to a slide
+FAR_AWAY = """
+<mujoco> <option cone="{cone}"/>
+  <worldbody> <geom type="plane" size="9 9 .1"/>
+    <geom type="box" size=".3 .3 .05" pos="{x} {y} .05"/>
+    <body name="arm" pos="{x} {y} .2"> <joint axis="0 1 0" damping=".1"/> <joint axis="0 0 1"/>
+      <geom type="capsule" fromto="0 0 0 .2 0 -.05" size=".02" contype="2" conaffinity="2"/> </body>
+    <body pos="{near} {y} .149"> <freejoint/> <geom type="box" size=".05 .05 .05" conaffinity="3"/> </body>
+    <body name="ball" pos="{x} {y} .5"> <freejoint/> <geom size=".03" contype="0" conaffinity="0"/> </body>
+    <body name="bar" pos="{near} {y} .6"> <freejoint/> <geom type="capsule" size=".02 .1" contype="0"/> </body>
+    <body name="slide" pos="{x} {y} .7"> <joint type="slide" axis="0 1 0" stiffness="9"/>
+      <geom size=".03" contype="0"/> </body>
+  </worldbody>
+  <equality> <connect body1="arm" body2="ball" anchor="0 0 .3"/> <weld body1="world" body2="bar"/>
+    <weld body1="slide" body2="bar" torquescale=".2"/> </equality> </mujoco>"""
+
+
+def far_away(cone, rng, number, x=100.0, y=-70.0):
+    """Such trees near their reference pose, in numbers of float32."""
+    scene = with_pairs(parse(FAR_AWAY.format(cone=cone, x=x, y=y, near=x + 0.21)))
+    qpos, qvel = scene.qpos0 + 0.01 * rng.normal(size=(number, scene.nq)), 0.2 * rng.normal(size=(number, scene.nv))
+    return scene, [x.astype(np.float32).astype(float) for x in (qpos, qvel, np.zeros((number, 0)))]
+
+
+@needs_manifolds
+@pytest.mark.unoptimized
+@pytest.mark.parametrize("cone", CONES)
+def test_trees_far_from_the_origin_step_as_in_mujoco(cone, rng):
+    """In float32, with contact and equality between them and with the world, as accurately as at the origin."""
+    for x, y in ((0.0, 0.0), (20.0, -5.0), (100.0, -70.0)):
+        scene, states = far_away(cone, rng, 24, x, y)
+        expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+        change = abs(expected - states[1]).max(1)
+        for dtype, tolerance, enough in ((torch.float64, 1e-12, 1e-9), (torch.float32, 1e-4, 1e-3)):
+            found = step(scene, states, tolerance=tolerance, dtype=dtype)[1]
+            assert (abs(found - expected).max(1) / change).max() < enough, (x, y, dtype)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
+def test_gradient_far_from_the_origin_is_that_of_differences(cone, rng):
+    scene, states = far_away(cone, rng, 48)
+    check_gradients_of_touching(scene, states, rng)
+    check_single_precision(scene, [x[:8] for x in states], rng)
+
+
 # A crank and a rocker, whose coupler closes the loop at sites, and a gripper whose fingers mirror each other.
 FOUR_BAR = """
 <mujoco> <option timestep="0.002"/> <default> <geom contype="0" conaffinity="0"/> </default>
@@ -131,6 +237,31 @@ def test_a_four_bar_linkage_turns_as_in_mujoco(rng):
     np.testing.assert_allclose(qpos, expected, atol=1e-8)
     np.testing.assert_allclose(qvel, velocity, atol=1e-6)
     np.testing.assert_allclose(qpos[:, 3], qpos[:, 4], atol=1e-3)
+
+
+@pytest.mark.unoptimized
+def test_tendons_pull_between_trees_far_from_the_origin(rng):
+    """Motors on tendons from the world to an arm and a free body."""
+    tendons = "".join(
+        f'<spatial name="{name}"> {"".join(f"<site site={site!r}/>" for site in sites)} </spatial>'
+        for name, sites in (("long", "wab"), ("short", "bw"))
+    )
+    scene = parse(f"""
+    <mujoco> <worldbody> <site name="w" pos="80 -9 1.5"/>
+      <body pos="80 -9 1"> <joint axis="0 1 0" damping=".1"/> <site name="a" pos=".3 0 .02"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" contype="0" conaffinity="0"/> </body>
+      <body pos="80.5 -9 1"> <freejoint/> <geom type="box" size=".1 .05 .03"/> <site name="b" pos=".05 0 .03"/> </body>
+    </worldbody> <tendon> {tendons} </tendon>
+    <actuator> <motor tendon="long" gear="-3" ctrlrange="0 1"/> <motor tendon="short" gear="-2" ctrlrange="0 1"/>
+    </actuator> </mujoco>""")
+    qpos, qvel = scene.qpos0 + 0.05 * rng.normal(size=(12, scene.nq)), 0.5 * rng.normal(size=(12, scene.nv))
+    states = [x.astype(np.float32).astype(float) for x in (qpos, qvel, rng.uniform(-1, 1, (12, scene.nu)))]
+    expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+    change = abs(expected - states[1]).max(1)
+    for dtype, tolerance, enough in ((torch.float64, 1e-12, 1e-10), (torch.float32, 1e-4, 1e-3)):
+        found = step(scene, states, tolerance=tolerance, dtype=dtype)[1]
+        assert (abs(found - expected).max(1) / change).max() < enough
+    check_gradients(scene, [x[:6] for x in states], rng)
 
 
 @SLOW
@@ -568,6 +699,43 @@ def test_capsules_that_a_turned_body_makes_parallel_touch_twice(where, rng):
     expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
     change = abs(expected - states[1]).max(1)
     np.testing.assert_array_less(abs(step(scene, states)[1] - expected).max(1), 1e-6 * change)
+
+
+def slippery(boxes, friction, option=""):
+    """A pile of boxes, of which the third is turned and heavy."""
+    bodies = "".join(
+        f'<body pos="{0.02 * k} 0 {0.199 * k + 0.098}" euler="0 0 {20 * (k == 2)}"> <freejoint/>'
+        f'<geom type="box" size=".1 .1 .1" friction="{friction}" density="{1000 + 4000 * (k == 2)}"/> </body>'
+        for k in range(boxes)
+    )
+    return parse(f"<mujoco> {option} <worldbody> {FLOOR} {bodies} </worldbody> </mujoco>")
+
+
+@needs_manifolds
+@pytest.mark.unoptimized
+@pytest.mark.parametrize("boxes", [2, 3])
+def test_slippery_boxes_slide_as_in_mujoco(boxes, rng, monkeypatch):
+    """With pyramids, whose normals are the stiffer the less friction there is, and within 30 passes."""
+    monkeypatch.setattr(simulator, "PASSES", 30)
+    for friction, option in ((0.02, ""), (0.05, ""), (0.02, '<option gravity="3 1 -9.81" impratio="5"/>'), (0.002, "")):
+        scene = slippery(boxes, friction, option)
+        states = np.tile(scene.qpos0, (32, 1)), 0.1 * rng.normal(size=(32, scene.nv)), np.zeros((32, 0))
+        states = [x.astype(np.float32).astype(float) for x in states]
+        expected = in_mujoco(scene, *states, model=model_as_it_is(scene))[1]
+        change = abs(expected - states[1]).max(1)
+        for dtype, tolerance, enough in ((torch.float64, 1e-12, 1e-8), (torch.float32, 1e-4, 3e-3)):
+            if dtype == torch.float64 or (friction > 0.01 and not option):
+                _, found, residual = step(scene, states, tolerance=tolerance, dtype=dtype)
+                assert residual.max() < tolerance
+                assert (abs(found - expected).max(1) / change).max() < enough, (friction, dtype)
+
+
+@needs_manifolds
+@pytest.mark.unoptimized
+def test_gradient_of_slippery_boxes_is_that_of_differences(rng):
+    scene = slippery(2, 0.01)
+    qpos = scene.qpos0 + 0.003 * rng.normal(size=(6, scene.nq))  # without edges on each other
+    check_gradients(scene, (qpos, 0.1 * rng.normal(size=(6, scene.nv)), np.zeros((6, 0))), rng)
 
 
 @needs_manifolds

@@ -26,6 +26,7 @@ from scenes import (
 )
 from test_constraint import PASSES, SLOW, H, in_mujoco, mujoco_model, step, tree_states
 from test_gradient import measure, weights
+from test_gyroscope import several, spinning
 from test_pairs import model_as_it_is, solid_states, solids, tangled, tied_states, tied_tree
 from torch import Tensor
 
@@ -148,6 +149,7 @@ CASES = {
     "touching": (lambda: touching("robots", "elliptic"), HARD),
     "touching pyramids": (lambda: touching("robots", "pyramidal"), HARD),
     "touching solids": (lambda: touching("solids", "elliptic"), HARD),
+    "spinning": (lambda: ((scene := several("heavy")), spinning(scene, 4, np.random.default_rng(0), 5.0)), HARD),
 }
 TOUCHING = "touching", "touching pyramids", "touching solids"
 QUICK = "ball", "Euler's servos", "soft"

@@ -27,6 +27,7 @@ from functools import cache
 
 import warp as wp
 
+from diffsim.kernels.gyroscope import gyroscope
 from diffsim.kernels.laws.force import external_force
 from diffsim.kernels.laws.joint import joint_law
 from diffsim.kernels.laws.muscle import muscle_law
@@ -54,9 +55,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     link_of, qpos_adr, gradient = kin.link_of, kin.qpos_adr, gradient_access(spec)
     euler, phi, parameters = integrator_adjoint(spec), partial_derivatives(spec), parameter_adjoint(spec)
     joint, force, muscle = joint_law(spec), external_force(spec), muscle_law(spec)
-    CLAMP, MUSCLE, TENDON, SITE, STIFFNESS = spec.has("clamp muscle tendon site stiffness")
+    CLAMP, MUSCLE, TENDON, SITE, STIFFNESS, GYROSCOPIC = spec.has("clamp muscle tendon site stiffness gyroscopic")
     transmission = transmission_law(spec) if TENDON or SITE else None
-    solve, pairs = factor_solve(spec, transmission), pair_adjoint(spec) if spec.pairs else None
+    gyro, pairs = gyroscope(spec) if GYROSCOPIC else None, pair_adjoint(spec) if spec.pairs else None
+    solve = factor_solve(spec, transmission, gyro)
     PAIRS, LEARNED, FLOATING, FORCED = spec.pairs > 0, spec.parameters > 0, spec.floating, spec.forced > 0
     VADR, NBALL, SLOTS, BLOCKS = spec.dof0 - 1, spec.nball, spec.room, spec.pair_sizes.blocks
     # Local arrays have at least one element, also where they are not read.
@@ -133,6 +135,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 parameters.add_parameters(m, here, ck, links, nodes, batch.ctrl, adj_parameters)
             if wp.static(PAIRS):
                 pairs.add_adjoint(m, here, links, contacts, nodes, adj, adj_parameters)
+            if wp.static(GYROSCOPIC):
+                base = gyro.add_adjoint(m, here, links, nodes, base, adj_parameters)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.gyroscope import gyroscope
 from diffsim.kernels.laws.joint import joint_law
 from diffsim.kernels.line_search import step_length
 from diffsim.kernels.mujoco.ground import contact_room, ground_contact
@@ -138,8 +139,8 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, vec6, Model, Lane, Ck = t.T, t.vec3, t.vec6, t.Model, t.Lane, t.Checkpoint
     Links, Motions, Loads, Root, Newton, Contacts = t.Links, t.Motions, t.Loads, t.Root, t.Newton, t.Contacts
     ground, state, pairs = ground_contact(spec), state_access(spec), pair_rows(spec) if spec.pairs else None
-    CONTACT, CHAIN = spec.has("contact tendon_chain")
-    transmission = transmission_law(spec) if CHAIN else None
+    CONTACT, CHAIN, GYROSCOPIC = spec.has("contact tendon_chain gyroscopic")
+    transmission, gyro = transmission_law(spec) if CHAIN else None, gyroscope(spec) if GYROSCOPIC else None
     PAIRS, DAMPED, ROOM, NV, SOLVES = spec.pairs > 0, spec.damped, contact_room(spec), spec.nv, spec.solves
 
     @wp.func
@@ -248,6 +249,9 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                     if wp.static(CHAIN):
                         if phase == SOLVE:
                             root = transmission.correct_change(m, here, links, motions, root)
+                    if wp.static(GYROSCOPIC):
+                        if phase == SOLVE:
+                            root = gyro.correct_change(m, here, links, motions, root)
                     phase = phase + 1
                     if wp.static(not DAMPED):
                         phase = DONE

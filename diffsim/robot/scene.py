@@ -148,6 +148,12 @@ class Scene:
         return self.constraints.pairs if self.constraints else None
 
     @property
+    def has_trees(self) -> bool:
+        """Tell whether each tree has an origin of its own: beside free bodies, or what it touches or is tied to."""
+        free = mujoco.mjtJoint.mjJNT_FREE in self.mj_model.jnt_type
+        return not self.floating and self.carrier == 0 and (free or self.pairs is not None)
+
+    @property
     def qpos_adr(self) -> Index:
         """Return the index in qpos (nlink,) of each link's joint, w, x and y of its quaternion for a ball joint."""
         passed = np.concatenate([[0], np.cumsum(self.ball == 2)[:-1]])  # balls, each one number longer than its rates
@@ -174,6 +180,8 @@ class Scene:
         damped, servos = bool(self.damping.any() or self.base_damping.any()), bool(self.servo_damping.any())
         present = {
             "floating": self.floating,
+            "trees": self.has_trees,
+            "gyroscopic": len(self.free_bodies) > 0,
             "hinge": bool((~self.slide & (self.ball < 0))[1:].any()),
             "slide": bool(self.slide[1:].any()),
             "ball": self.nball > 0,
@@ -214,6 +222,47 @@ class Scene:
                 break
             link += 1
         return link
+
+    @property
+    def free_bodies(self) -> Index:
+        """Return the links of free bodies without joints, whose spin MuJoCo's implicitfast integrates implicitly.
+
+        That changes nothing of a ball, whose inertia is the same about all axes, unless that is a parameter.
+        """
+        m, links = self.mj_model, list[int]()
+        if self.constraints is None or takes_euler(m):
+            return np.zeros(0, np.int32)
+        sizes = np.bincount(m.dof_treeid, minlength=m.ntree)
+        for dof in m.jnt_dofadr[m.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist():
+            link = 0 if self.floating else dof + 6
+            round_ = np.ptp(np.linalg.eigvalsh(self.inertia[link])) < 1e-9 * self.inertia[link].max()
+            round_ &= abs(self.com[link]).max() < 1e-9
+            if sizes[m.dof_treeid[dof]] == 6 and (self.parameters or not round_):
+                links.append(link)
+        return np.array(links, np.int32)
+
+    @property
+    def indivisible(self) -> str:
+        """Name what keeps threads of a GPU from sharing an environment, if anything does."""
+        if self.pairs:
+            return "rows between two bodies"
+        if self.transmissions:
+            return "actuators on fixed tendons or at sites"
+        return "free bodies with implicitfast" if len(self.free_bodies) else ""
+
+    @property
+    def moves_origin(self) -> Index:
+        """Mark links (nlink,) that carry the origin of their tree's spatial vectors, beside other trees: its root.
+
+        Of massless slides in a row, such as a free joint's, all do. So no digits are lost far from the world's origin.
+        """
+        marks = np.zeros(self.nlink, np.int32)
+        busy = np.isin(range(self.nlink), [*self.contact_link, *(self.pairs.link.flat if self.pairs else [])])
+        busy |= (self.mass > 0) | (np.bincount(self.parent[1:], minlength=self.nlink) > 1)
+        for link, parent in enumerate(self.parent.tolist()):
+            passed = self.slide[link] and self.slide[parent] and not busy[parent]
+            marks[link] = link > 0 and (parent == 0 or (marks[parent] and passed))
+        return marks
 
     @property
     def root(self) -> RootCoordinates:

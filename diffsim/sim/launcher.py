@@ -160,7 +160,7 @@ def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
 def default_division(scene: Scene, num_envs: int) -> Division:
     """Choose the division of an environment among GPU threads, as measured in docs/performance.md."""
     sharers = MUSCLE_SHARERS if "muscle" in scene.features else 1
-    if scene.pairs or scene.transmissions:
+    if scene.indivisible:
         return divide(scene)
     candidates = [divide(scene, groups * sharers, sharers) for groups in (1, 2, 4)]
     best = min(candidates, key=lambda division: (division.slots, division.threads_per_env))

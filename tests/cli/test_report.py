@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from scenes import parse, pendulum, robot, tendon
 
 from diffsim.robot.mjcf import load_scene
 from diffsim_cli.commands import main
-from diffsim_cli.report import approximations, report
+from diffsim_cli.report import approximations, report, steps_beside_mujoco
 
 LINK = '<body pos=".2 0 0"><joint axis="0 1 0"/><geom size=".02" pos=".1 0 0" contype="0" conaffinity="0"/></body>'
 
@@ -51,7 +52,9 @@ def test_command(tmp_path, capsys):
         refused = answer.startswith("Cannot")
         with pytest.raises(SystemExit, match="1") if refused else nullcontext():
             main(["check", *words.split()])
-        assert capsys.readouterr().out.startswith(answer)
+        out = capsys.readouterr().out
+        assert out.startswith(answer)
+        assert ("differs from MuJoCo's by" in out) == (not refused and "soft" not in words)
 
 
 @pytest.mark.parametrize(
@@ -146,3 +149,12 @@ def test_controls_and_timestep_are_named():
 
 def test_a_robot_that_meets_nothing_is_not_approximated():
     assert approximations(parse(pendulum('damping="0.1"', world=""))) == ()
+
+
+@pytest.mark.unoptimized
+@pytest.mark.parametrize("integrator, least, most", [("implicit", 0, 1e-6), ("Euler", 0, 1e-6), ("RK4", 0.5, 100)])
+def test_steps_are_compared_with_mujocos_own(integrator, least, most):
+    """With the integrator of the file."""
+    scene = parse(standing(geom='pos=".02 .03 0"', option=f'integrator="{integrator}" timestep="0.01"'))
+    error = float(re.search(r"by (\S+) %", steps_beside_mujoco(scene))[1])
+    assert least <= error < most

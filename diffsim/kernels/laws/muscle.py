@@ -32,7 +32,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
     T, vec3, vec6, Model, Lane, array = t.T, t.vec3, t.vec6, t.Model, t.Lane, t.Ts
     Links, Nodes, Adjoints, join, point_velocity = t.Links, t.Nodes, t.Adjoints, sp.join, sp.point_velocity
-    VARIED, block = spec.varied, blocks(spec)
+    VARIED, TREES, block = spec.varied, "trees" in spec.features, blocks(spec)
 
     @wp.func
     def compute_tensions(m: Model, here: Lane, ctrl: t.array2, tension: array):
@@ -66,7 +66,24 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
         i = m.pair_link[2 * pair]
         j = m.pair_link[2 * pair + 1]
         R = wp.transpose(links[i].R)
-        return i, j, R * links[j].R, R * (links[j].x - links[i].x)
+        apart = links[j].x - links[i].x
+        if wp.static(TREES):
+            apart = apart + (links[j].origin - links[i].origin)
+        return i, j, R * links[j].R, R * apart
+
+    @wp.func
+    def about_second(wrench: vec6, i: int, j: int, links: Links):
+        """Return a wrench about the origin of link i's tree about that of link j's."""
+        if wp.static(TREES):
+            wrench = wrench + join(wp.cross(links[i].origin - links[j].origin, wp.spatial_bottom(wrench)), vec3())
+        return wrench
+
+    @wp.func
+    def about_first(twist: vec6, i: int, j: int, links: Links):
+        """Return a twist about the origin of link j's tree about that of link i's."""
+        if wp.static(TREES):
+            twist = twist + join(vec3(), wp.cross(wp.spatial_top(twist), links[i].origin - links[j].origin))
+        return twist
 
     @wp.func
     def add_muscles(m: Model, here: Lane, tension: array, links: Links, loads: t.Loads):
@@ -85,7 +102,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
                 torque = torque + wp.cross(a, f)
             wrench = wrench_to_world(R, x, torque, force)
             loads[i].f = loads[i].f - wrench
-            loads[j].f = loads[j].f + wrench
+            loads[j].f = loads[j].f + about_second(wrench, i, j, links)
 
     @wp.func
     def add_muscles_adjoint(
@@ -96,7 +113,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
             i, j, rotation, offset = relative_pose(m, links, pair)
             R = links[i].R
             x = links[i].x
-            w = twist_to_link(R, x, nodes[j].W - nodes[i].W)
+            w = twist_to_link(R, x, about_first(nodes[j].W, i, j, links) - nodes[i].W)
             force = vec3()
             torque = vec3()
             g_point = vec3()
@@ -120,8 +137,8 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
             wrench = wrench_to_world(R, x, torque, force)
             gp = wrench_to_world(R, x, g_point_torque, g_point) + wp.spatial_cross_dual(nodes[i].W, wrench)
             adj[i].w = adj[i].w - wrench
-            adj[j].w = adj[j].w + wrench
+            adj[j].w = adj[j].w + about_second(wrench, i, j, links)
             adj[i].p = adj[i].p - gp
-            adj[j].p = adj[j].p + gp
+            adj[j].p = adj[j].p + about_second(gp, i, j, links)
 
     return functions(locals())

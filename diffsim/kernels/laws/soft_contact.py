@@ -45,7 +45,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         """
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         r = T(m.contact_radius[c])
-        depth, E, curvature = ground.distance(m, here, c, centre, carrier, r)
+        depth, E, curvature = ground.distance(m, here, c, ground.about_carrier(link, centre), carrier, r)
         p = centre - in_world(E, vec3(T(0.0), T(0.0), r))
         v = in_frame(E, point_velocity(link.V, p))
         return p, v, depth, E, curvature

@@ -30,7 +30,7 @@ from diffsim.kernels.thread.wide import blocks
 def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
     """Make the ground's distance from a sphere, and the frame of what the sphere touches."""
     t, block, BLOCK, TERRAIN = types(spec), blocks(spec), spec.block, "terrain" in spec.features
-    FRAMED = spec.framed
+    FRAMED, TREES = spec.framed, "trees" in spec.features
     T, U, vec3, vec4, mat3, Model, uvec4 = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.scene.vec4
 
     @wp.func
@@ -153,6 +153,13 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
             return carrier + centre[2] - T(m.contact_radius[c]), wp.identity(3, dtype=T), T(0.0)
         else:
             return carrier + centre[2] - T(m.contact_radius[c]), T(1.0), T(0.0)
+
+    @wp.func
+    def about_carrier(link: t.Link, p: vec3):
+        """Return a point of a link, which may be about an origin of its tree's own, about the carrier."""
+        if wp.static(TREES):
+            return link.origin + p
+        return p
 
     @wp.func
     def in_frame(E: t.Frame, v: vec3):

@@ -59,7 +59,7 @@ def ground_contact(spec: KernelSpec) -> SimpleNamespace:
         """
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         reach = T(m.contact_radius[c] + m.contact_params[c][10])
-        distance, E, curvature = terrain.distance(m, here, c, centre, carrier, reach)
+        distance, E, curvature = terrain.distance(m, here, c, terrain.about_carrier(link, centre), carrier, reach)
         active = pick(distance, T(m.contact_params[c][10]), T(1.0), T(0.0))
         if wp.static(BOX):  # of a box MuJoCo takes the corners of the lower half
             if m.contact_radius[c] == U(0.0):

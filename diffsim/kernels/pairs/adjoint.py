@@ -42,7 +42,7 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
     SOLVES, LEARNED = spec.solves, spec.parameters > 0
     COLUMN = pair_column(spec)  # of jar in the checkpoint
     COLUMNS = spec.columns.pairs
-    TOUCH = "geoms_rows" in spec.features
+    TOUCH, TREES = spec.has("geoms_rows trees")
     geoms, touch = (pair_geoms(spec, True), touch_adjoint(spec)) if TOUCH else (None, None)
     ENOUGH = ACCURACY_ADJOINT[int(t.U == wp.float32)]
 
@@ -118,12 +118,16 @@ def pair_adjoint(spec: KernelSpec) -> SimpleNamespace:
         state = rows.geoms_state(m, here, c, contacts)
         g_r = g[2] * state[3] - wp.dot(f, rate) * state[1]
         g_turn = wp.cross(g, contacts[c].jar - vec3(T(0.0), T(0.0), state[2])) - wp.cross(f, rate)
-        g_p = add_end_adjoint(i, contacts[c].p, b, -(E * g), -(E * f), links, nodes, adj)
+        g_p = add_end_adjoint(i, contacts[c].q, b, -(E * g), -(E * f), links, nodes, adj)
         g_p = g_p + add_end_adjoint(j, contacts[c].p, b, E * g, E * f, links, nodes, adj)
         n = geoms.normal_of(c, contacts)
         g_n = touch.normal_adjoint(n, E, g_turn)
         second = touch.contact_adjoint(m, c, links, contacts, n, g_p, g_r, g_n)
-        adj[i].p = adj[i].p + force_at(contacts[c].p, g_p) + join(wp.cross(n, g_n), vec3()) - second
+        first = force_at(contacts[c].p, g_p) + join(wp.cross(n, g_n), vec3()) - second
+        if wp.static(TREES):
+            apart = J.offset(J.reference(m, s), i, links)
+            first = first + join(wp.cross(apart, wp.spatial_bottom(first)), vec3())
+        adj[i].p = adj[i].p + first
         adj[j].p = adj[j].p + second
 
     @wp.func

@@ -19,26 +19,40 @@ from diffsim.kernels.pairs.jacobian import pair_jacobian
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
+from diffsim.kernels.thread.wide import blocks
 from diffsim.robot.types import JOINT, POINT, TURN
-
-LEAST = 1e-12  # of 4 w^2, at a rotation by half a turn
 
 
 @cache
 def equality_rows(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of equality."""
-    t, sp, ends = types(spec), spatial(spec), pair_jacobian(spec).ends
-    T, vec3, vec6, mat3, Model, Links, Contacts = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Links, t.Contacts
+    t, sp, J, ends = types(spec), spatial(spec), pair_jacobian(spec), pair_jacobian(spec).ends
+    T, vec3, vec4, vec6, mat3, Model, Links, Contacts = (
+        getattr(t, name) for name in "T vec3 vec4 vec6 mat3 Model Links Contacts".split()
+    )
+    pick = blocks(spec).pick
     JOINTS, POINTS, TURNS = spec.has("joint_rows point_rows turn_rows")
 
     @wp.func
     def turn_of(m: Model, s: int, links: Links):
-        """Return w and the vector part of the quaternion of j relative to i, and the frame of i."""
+        """Return w and the vector part of the quaternion of j relative to i, up to its sign, and the frame of i."""
         i, j = ends(m, s)
         R = links[i].R * mat3(m.row_frame[2 * s])
         Q = wp.transpose(R) * (links[j].R * mat3(m.row_frame[2 * s + 1]))
-        w = T(0.5) * wp.sqrt(wp.max(T(1.0) + wp.trace(Q), T(LEAST)))
-        v = vec3(Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1]) / (T(4.0) * w)
+        # 4 (x, y, z, w) times that one of the four which is largest
+        skew = vec3(Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1])
+        square = T(1.0) + wp.trace(Q)
+        numbers = vec4(skew[0], skew[1], skew[2], square)
+        for k in range(3):
+            other = T(1.0) - wp.trace(Q) + T(2.0) * Q[k, k]
+            row = vec4(Q[0, k] + Q[k, 0], Q[1, k] + Q[k, 1], Q[2, k] + Q[k, 2], skew[k])
+            row[k] = other
+            for n in range(4):
+                numbers[n] = pick(square, other, row[n], numbers[n])
+            square = wp.max(square, other)
+        numbers = numbers * (T(0.5) / wp.sqrt(square))
+        w = numbers[3]
+        v = vec3(numbers[0], numbers[1], numbers[2])
         return w, v, R
 
     @wp.func
@@ -63,12 +77,6 @@ def equality_rows(spec: KernelSpec) -> SimpleNamespace:
         return vec3(value, slope, curvature)
 
     @wp.func
-    def point_of(m: Model, end: int, links: Links):
-        """Return the place of a block's point, on the link of that end."""
-        i = m.row_link[end]
-        return sp.on_link(links[i].R, links[i].x, m.row_point[end])
-
-    @wp.func
     def violation(m: Model, s: int, links: Links):
         """Return the violation of a block."""
         r = vec3()
@@ -77,7 +85,8 @@ def equality_rows(spec: KernelSpec) -> SimpleNamespace:
                 r[0] = links[m.row_link[2 * s + 1]].q - T(m.row_ref[2 * s + 1]) - polynomial(m, s, links)[0]
         if wp.static(POINTS):
             if m.row_kind[s] == POINT:
-                r = point_of(m, 2 * s + 1, links) - point_of(m, 2 * s, links)
+                about = J.reference(m, s)
+                r = J.point_about(m, 2 * s + 1, about, links) - J.point_about(m, 2 * s, about, links)
         if wp.static(TURNS):
             if m.row_kind[s] == TURN:
                 w, v, R = turn_of(m, s, links)
@@ -94,8 +103,9 @@ def equality_rows(spec: KernelSpec) -> SimpleNamespace:
                 contacts[c].slope = polynomial(m, s, links)[1]
         if wp.static(POINTS):
             if m.row_kind[s] == POINT:
-                contacts[c].p = point_of(m, 2 * s + 1, links)
-                contacts[c].q = point_of(m, 2 * s, links)
+                i, j = ends(m, s)
+                contacts[c].p = J.point_about(m, 2 * s + 1, j, links)
+                contacts[c].q = J.point_about(m, 2 * s, i, links)
         if wp.static(TURNS):
             if m.row_kind[s] == TURN:  # half the rate of the quaternion's vector part
                 w, v, R = turn_of(m, s, links)

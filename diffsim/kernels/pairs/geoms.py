@@ -11,10 +11,10 @@ import warp as wp
 
 from diffsim.kernels.pairs.boxes import box_contacts
 from diffsim.kernels.pairs.capsules import capsule_contacts
+from diffsim.kernels.pairs.jacobian import pair_jacobian
 from diffsim.kernels.pairs.spheres import sphere_contacts
 from diffsim.kernels.pairs.touch import geom_types
 from diffsim.kernels.thread.model import functions, types
-from diffsim.kernels.thread.spatial import spatial
 from diffsim.kernels.thread.spec import KernelSpec
 from diffsim.kernels.thread.wide import blocks
 from diffsim.robot.types import BALL_BOX, BOXES, CAPSULE_BOX, PARALLEL
@@ -23,19 +23,13 @@ from diffsim.robot.types import BALL_BOX, BOXES, CAPSULE_BOX, PARALLEL
 @cache
 def pair_geoms(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
     """Make the functions that place contacts of two geoms, with or without what only their adjoint needs."""
-    t, one, sp, block = types(spec), geom_types(spec.dtype), spatial(spec), blocks(spec)
+    t, one, block, J = types(spec), geom_types(spec.dtype), blocks(spec), pair_jacobian(spec)
     T, U, vec3, vec4, mat3, Model, Links, Contacts = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.Links, t.Contacts
     size3, Geom, Touch, Touches = one.vec3, one.Geom, one.Touch, one.Touches
     pick, element, with_element = block.pick, block.element, block.with_element
-    BLOCK, MOST = spec.block, spec.pair_sizes.most
+    BLOCK, MOST, TREES = spec.block, spec.pair_sizes.most, "trees" in spec.features
     spheres, capsules, boxes = (make(U) for make in (sphere_contacts, capsule_contacts, box_contacts))
     PARALLELS, BALLS, CAPSULE_BOXES, TWO_BOXES = spec.has("parallel_geoms ball_box_geoms capsule_box_geoms box_geoms")
-
-    @wp.func
-    def centre_of(m: Model, end: int, links: Links):
-        """Return the centre of a geom, the end 2 s or 2 s + 1 of block s."""
-        i = m.row_link[end]
-        return sp.on_link(links[i].R, links[i].x, m.row_point[end])
 
     @wp.func
     def frame_of(m: Model, end: int, links: Links):
@@ -126,11 +120,12 @@ def pair_geoms(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
     def place(m: Model, s: int, near: T, end: int, links: Links, contacts: Contacts):
         """Place the contacts of the geoms with the first block s, where near > 0, in the elements from `end` on.
 
-        Returns the most that an environment has.
+        Their points are about the origin of J.reference. Returns the most that an environment has.
         """
-        x1 = centre_of(m, 2 * s, links)
+        about = J.reference(m, s)
+        x1 = J.point_about(m, 2 * s, about, links)
         R1 = frame_of(m, 2 * s, links)
-        x2 = centre_of(m, 2 * s + 1, links)
+        x2 = J.point_about(m, 2 * s + 1, about, links)
         R2 = frame_of(m, 2 * s + 1, links)
         margin = m.row_params[s][10]
         found = wp.zeros(shape=MOST, dtype=Touch)
@@ -148,6 +143,8 @@ def pair_geoms(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         for c in range(number):
             contacts[end + c].row = m.row_partner[s] + c - 1
             contacts[end + c].q = contacts[end + c].p
+            if wp.static(TREES):
+                contacts[end + c].q = contacts[end + c].p + J.offset(about, m.row_link[2 * s], links)
             E, along, size = contact_frame(normal_of(end + c, contacts))
             contacts[end + c].E = E
         contacts[end].row = s

@@ -1,7 +1,8 @@
 """J of a block of three rows between the links i (first) and j (second), and its transpose.
 
-Points of both links have J a = E' (a_j - a_i), with E the frame of the contact of two geoms, or the world's for a POINT
-(equality.py). A TURN has E' (A_j - A_i) of the angular accelerations, a JOINT the accelerations of both joints.
+Points of both links, each about the origin of its own tree (kinematics.py), have J a = E' (a_j - a_i), with E the frame
+of the contact of two geoms, or the world's for a POINT (equality.py). A TURN has E' (A_j - A_i) of the angular
+accelerations, a JOINT the accelerations of both joints.
 """
 
 from functools import cache
@@ -19,13 +20,35 @@ from diffsim.robot.types import JOINT, TURN
 def pair_jacobian(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of J."""
     t, sp = types(spec), spatial(spec)
-    T, vec3, vec6, Model, Contacts = t.T, t.vec3, t.vec6, t.Model, t.Contacts
-    force_at, point_velocity = sp.force_at, sp.point_velocity
+    T, vec3, vec6, Model, Links, Contacts = t.T, t.vec3, t.vec6, t.Model, t.Links, t.Contacts
+    force_at, point_velocity, TREES = sp.force_at, sp.point_velocity, "trees" in spec.features
 
     @wp.func
     def ends(m: Model, s: int):
         """Return the slots of a block's two links."""
         return m.row_link[2 * s], m.row_link[2 * s + 1]
+
+    @wp.func
+    def reference(m: Model, s: int):
+        """Return the link about whose origin a block's ends are compared: the second, or the first if that is fixed."""
+        i, j = ends(m, s)
+        return wp.where(j > 0, j, i)
+
+    @wp.func
+    def offset(i: int, r: int, links: Links):
+        """Return the origin of link i about that of link r."""
+        if wp.static(TREES):
+            return links[i].origin - links[r].origin
+        return vec3()
+
+    @wp.func
+    def point_about(m: Model, end: int, r: int, links: Links):
+        """Return the place of a block's point, on the link of that end, about the origin of link r."""
+        i = m.row_link[end]
+        p = sp.on_link(links[i].R, links[i].x, m.row_point[end])
+        if wp.static(TREES):  # of a fixed point p is large, and only the sum is small
+            p = p + offset(i, r, links)
+        return p
 
     @wp.func
     def rates(m: Model, c: int, contacts: Contacts, first: vec6, second: vec6, first_rate: T, second_rate: T):

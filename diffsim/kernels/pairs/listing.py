@@ -23,7 +23,7 @@ def pair_list(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
     """Make the functions that place and list blocks of rows, with or without what only their adjoint needs."""
     t, sp, block, equality, sizes = types(spec), spatial(spec), blocks(spec), equality_rows(spec), spec.pair_sizes
     T, U, vec3, Model, Lane, Links, Contacts = t.T, t.U, t.vec3, t.Model, t.Lane, t.Links, t.Contacts
-    FLOATING, WORLD, BLOCK, TOUCH = spec.floating, spec.room - 1, spec.block, "geoms_rows" in spec.features
+    FLOATING, WORLD, BLOCK, (TOUCH, TREES) = spec.floating, spec.room - 1, spec.block, spec.has("geoms_rows trees")
     EQUALITIES, HEADS, PLACES, LAST = sizes.equalities, sizes.heads, sizes.places, sizes.last
     geoms = pair_geoms(spec, adjoint) if TOUCH else None
 
@@ -80,11 +80,20 @@ def pair_list(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
             end = end + 1
         if wp.static(TOUCH):
             centres = wp.zeros(shape=PLACES, dtype=vec3)
+            if wp.static(TREES):
+                origins = wp.zeros(shape=PLACES, dtype=vec3)
             for k in range(places):
                 i = m.place_link[k]
                 centres[k] = sp.on_link(links[i].R, links[i].x, m.place_point[k])
+                if wp.static(TREES):
+                    origins[k] = links[i].origin
+                    if i == 0:  # a fixed point, which may be as far away
+                        origins[k] = centres[k]
+                        centres[k] = vec3()
             for s in range(equalities, heads):
                 d = centres[m.row_place[2 * s + 1]] - centres[m.row_place[2 * s]]
+                if wp.static(TREES):
+                    d = d + (origins[m.row_place[2 * s + 1]] - origins[m.row_place[2 * s]])
                 near = T(m.row_reach_sq[s]) - wp.dot(d, d)  # of their bounding spheres
                 if block.any_of(near):
                     begin = end

@@ -41,7 +41,7 @@ def row_solver(spec: KernelSpec, array: str) -> SimpleNamespace:
     t, block, J, tree = types(spec), blocks(spec), pair_jacobian(spec), branch_solver(spec, array)
     T, vec3, mat6, pick, clear, solve_tree = t.T, t.vec3, t.mat6, block.pick, tree.clear, tree.solve_tree
     Model, Lane, Links, Contacts, Branches = t.Model, t.Lane, t.Links, t.Contacts, getattr(t, array)
-    STEPS = min(3 * spec.pairs, spec.nv) + 4  # at most: the rank of the rows, and some for rounding
+    STEPS = 2 * min(3 * spec.pairs, spec.nv) + 4  # at most: twice the rank of the rows, as rounding costs steps
 
     @wp.func
     def spread(m: Model, c: int, contacts: Contacts, f: vec3, branches: Branches):

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.pairs.geoms import pair_geoms
+from diffsim.kernels.pairs.jacobian import pair_jacobian
 from diffsim.kernels.pairs.spheres import TINY
 from diffsim.kernels.thread.model import functions, types
 from diffsim.kernels.thread.spatial import spatial
@@ -25,11 +26,11 @@ PARALLEL = 1e-12, 1e-6
 def touch_adjoint(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of the adjoint.
 
-    Each returns the adjoint of the second link's pose beside a first one that stays, as a wrench. The adjoints of the
-    contact's point are g_p, of its distance g_r, of its normal n g_n. It moves rigidly with both links together, so
-    that the first one's wrench follows (adjoint.py).
+    Each returns the adjoint of the second link's pose beside a first one that stays, as a wrench about the origin of
+    J.reference. The adjoints of the contact's point are g_p, of its distance g_r, of its normal n g_n. It moves rigidly
+    with both links together, so that the first one's wrench follows (adjoint.py).
     """
-    t, sp, block, geoms = types(spec), spatial(spec), blocks(spec), pair_geoms(spec, True)
+    t, sp, block, geoms, J = types(spec), spatial(spec), blocks(spec), pair_geoms(spec, True), pair_jacobian(spec)
     T, vec3, vec6, mat3, Model, Links, Contacts = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Links, t.Contacts
     pick, force_at, join, frame_of = block.pick, sp.force_at, sp.join, geoms.frame_of
     LEAST_DET = PARALLEL[int(t.U == wp.float32)]
@@ -131,7 +132,7 @@ def touch_adjoint(spec: KernelSpec) -> SimpleNamespace:
                 wrench = blend(how[3], face, wrench)
                 if wp.static(CAPSULE_BOXES):
                     if kind == CAPSULE_BOX:  # as s moves
-                        centre = geoms.centre_of(m, 2 * s, links)
+                        centre = J.point_about(m, 2 * s, J.reference(m, s), links)
                         a1 = half_axis(m, 2 * s, links)
                         g_s = wp.dot(g_p - wp.spatial_bottom(wrench), a1)
                         wrench = wrench - force_at(centre, g_s * contacts[c].a)

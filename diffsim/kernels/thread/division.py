@@ -51,8 +51,8 @@ def divide(scene: Scene, threads_per_env: int = 1, sharers: int = 1) -> Division
             f"threads_per_env is {threads_per_env!r} and sharers {sharers!r}: both must be one of "
             f"{', '.join(map(str, POWERS))}, and sharers not the larger one"
         )
-    if threads_per_env > 1 and (scene.pairs or scene.transmissions):
-        what = "rows between two bodies" if scene.pairs else "actuators on fixed tendons or at sites"
+    if threads_per_env > 1 and scene.indivisible:
+        what = scene.indivisible
         raise ValueError(f"threads_per_env is {threads_per_env}, must be 1 with {what}")
     pulled = np.unique(scene.segment_muscle).tolist()  # the other actuators are motors, on the lanes of their links
     ends = [{0} | set(scene.segment_link[scene.segment_muscle == k].flatten()) for k in pulled]

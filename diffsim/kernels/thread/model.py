@@ -135,6 +135,7 @@ FIELDS: dict[str, Field] = {
     "link": ("ints", lambda n: n.link),  # the link's number in the scene, from which its joint's place in qvel follows
     "parent": ("ints", lambda n: n.to_slots(n.scene.parent)),  # slot of the parent
     **_links("ints", "slide"),  # 1 of a slide joint
+    **_links("ints", "moves_origin"),  # 1 of a link that carries the origin of its tree, with several
     # The frame: R = R_parent (rot0 + sin q rot1 + cos q rot2)
     "rot0": ("mat3s", lambda n: n.joint_rotations[0]),  # the constant part
     "rot1": ("mat3s", lambda n: n.joint_rotations[1]),  # times sin q
@@ -160,6 +161,7 @@ FIELDS: dict[str, Field] = {
     "motor_slot": ("ints", lambda n: n.motor_slot.flatten()),  # (lane, motor), 0 if the motor's link is on another lane
     "motor_lane": ("ints", lambda n: n.motor_lane),  # the lane that writes the motor's gradient
     **_scenes("reals", "gear motor_bias"),  # force of an actuator: gear ctrl + motor_bias
+    "free_body": ("ints", lambda n: n.slot[0, n.scene.free_bodies]),  # the links of gyroscope.py
     # Muscles: a segment runs from point a of link pair_link[2 k] to point b of link pair_link[2 k + 1]
     "muscle_begin": ("ints", lambda n: np.cumsum([0, *map(len, n.division.muscles)])),  # of each lane, in muscle
     "muscle": ("ints", lambda n: sum(n.division.muscles, [])),  # actuators that are muscles, by lane
@@ -340,6 +342,8 @@ def types(spec: KernelSpec) -> SimpleNamespace:
             "newton_wdot": vec3,  # angular acceleration of Newton's iterate
         },
     }
+    if "trees" in spec.features:
+        structs["Link"] |= {"origin": vec3}  # m, of its tree's spatial vectors, in the world
     if spec.features & {"clamp", "tendon"}:
         structs["Node"] |= {
             "motor": T,  # force of the joint's motors

@@ -83,9 +83,9 @@ class KernelSpec:
 
     @property
     def damped(self) -> bool:
-        """Tell whether damping follows the constraints."""
+        """Tell whether damping, or what free bodies have of that kind (gyroscope.py), follows the constraints."""
         *dampers, explicit = self.has("damping base_damping tendon_damping explicit_damping")
-        return self.constrained and any(dampers) and not explicit
+        return self.constrained and any(dampers) and not explicit or "gyroscopic" in self.features
 
     @property
     def columns(self) -> Columns:

@@ -19,7 +19,7 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     sp, read = spatial(spec), blocks(spec).read
     join, log_quat = sp.join, sp.log_quat
     NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
-    BALL, STIFFNESS, HINGE, SLIDE, TERRAIN = spec.has("ball stiffness hinge slide terrain")
+    BALL, STIFFNESS, HINGE, SLIDE, TERRAIN, TREES = spec.has("ball stiffness hinge slide terrain trees")
     ENV_LAST, THREADS_PER_ENV = spec.env_last, spec.threads_per_env
 
     @wp.func
@@ -83,6 +83,8 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     def place_links(m: Model, here: Lane, links: t.Links, carrier: t.CarrierPos):
         """Compute each link's pose about the carrier, joint axis and velocity; returns the carrier's position.
 
+        Beside other trees the link that moves_origin of its own tree takes the carrier's place.
+
         On entry R of a ball joint's first link is the joint's own rotation.
         """
         for i in range(1, here.n):
@@ -115,6 +117,13 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                         carrier = carrier + links[i].q * vec2(a[0], a[2])
                     else:
                         carrier = carrier + a[2] * links[i].q
+            if wp.static(TREES):
+                links[i].origin = links[p].origin
+                if m.moves_origin[k] == 1:
+                    links[i].origin = links[i].origin + xi
+                    xi = vec3()
+                    if m.slide[k] == 0:
+                        Si = join(a, vec3())
             links[i].x = xi
             links[i].S = Si
             links[i].V = links[p].V + Si * links[i].qd

@@ -237,13 +237,18 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
     return functions(locals())
 
 
-def factor_solve(spec: KernelSpec, chain: SimpleNamespace | None) -> wp.Function:
-    """Make the adjoint's solves; `chain` is transmission.py's law if a tendon damps a chain of joints."""
+def factor_solve(spec: KernelSpec, chain: SimpleNamespace | None, gyro: SimpleNamespace | None) -> wp.Function:
+    """Make the adjoint's solves.
+
+    chain: transmission.py's law if a tendon damps a chain of joints; gyro: gyroscope.py's with such free bodies.
+    """
     t, kin, inertia, sums, joint = types(spec), kinematics(spec), base_inertia(spec), lane_sums(spec), joint_law(spec)
     T, vec6, load, link_of, join = t.T, t.vec6, kin.load, kin.link_of, spatial(spec).join
     Model, Lane, Ck, Links, Nodes, Base = t.Model, t.Lane, t.Checkpoint, t.Links, t.Nodes, t.Base
     FLOATING, SLOTS, SOLVES, DAMPED = spec.floating, spec.slots, spec.solves, spec.damped
-    BASE_DAMPED, CLAMP, TENDON_DAMPING, CHAIN = spec.has("base_damping clamp tendon_damping tendon_chain")
+    BASE_DAMPED, CLAMP, TENDON_DAMPING, CHAIN, GYROSCOPIC = spec.has(
+        "base_damping clamp tendon_damping tendon_chain gyroscopic"
+    )
     THREADS_PER_ENV, SHARERS, TRUNK = spec.threads_per_env, spec.sharers, spec.trunk
 
     @wp.func
@@ -312,10 +317,16 @@ def factor_solve(spec: KernelSpec, chain: SimpleNamespace | None) -> wp.Function
                         nodes[i].g = nodes[i].g + damping_pass * nodes[i].tendon_damping * nodes[i].lam
             if wp.static(CHAIN):
                 chain.add_damping(m, here, damping_pass, nodes)
+            if wp.static(GYROSCOPIC):
+                if s == 1:
+                    g_base = gyro.add_transpose(m, here, links, nodes, g_base)
             solve(m, here, ck, SOLVES * here.row + s, links, nodes, g_base)
             if wp.static(CHAIN):
                 if s == 0:
                     chain.correct_lambda(m, here, ck, links, nodes)
+            if wp.static(GYROSCOPIC):
+                if s == 0:
+                    gyro.correct_lambda(m, here, links, nodes, g_base)
             damping_pass = T(1.0)
 
     return solve_all
