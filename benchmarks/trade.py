@@ -227,9 +227,9 @@ def panels(rows: list[Cells]) -> Iterator[Panel]:
             points |= {name: point} if part == "accuracy" else {}
             lines.append(Line([point[0]] * 2, [min(shares), max(shares)], f"{style[:-1]}-"))
             lines.append(Line([point[0]], [point[1]], style, label))
-        through, ends = sorted(points[name] for name in front(points)), [line.x[0] for line in lines]
+        through = sorted(points[name] for name in front(points))
         lines.append(Line([x for x, _ in through], [y for _, y in through], "k:", "front", 0.8))
-        lines.append(Line([min(ends), max(ends)], [0, 0], "k-", width=0.5))
+        lines.append(Line([0, max(line.x[0] for line in lines)], [0, 0], "k-", width=0.5))
         yield Panel(lines, task, "core seconds of training", SHARE)
 
 
