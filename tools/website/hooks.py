@@ -83,8 +83,8 @@ def drawn(found: re.Match[str]) -> str:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """The page as the site shows it."""
     place = page.file.src_uri
-    parts = re.split(rf"({CODE})", markdown, flags=re.MULTILINE)
-    for k in range(0, len(parts), 2):  # between pieces of code
+    parts = re.split(rf"({CODE.replace('(?!math)', '')})", markdown, flags=re.MULTILINE)
+    for k in range(0, len(parts), 2):  # between pieces of code, and formulas
         text = re.sub(r"<!-- .*?-->\n?", "", parts[k], flags=re.DOTALL)
         parts[k] = LINK.sub(lambda link: moved(link, place), text)
     return MATH.sub(drawn, "".join(parts))
