@@ -26,7 +26,7 @@ import common
 import mujoco
 import numpy as np
 import torch
-from common import Part, measured, run
+from common import Part, measured, plot, run
 from tables import Row, grouped, numbers
 from torch import Tensor
 
@@ -220,7 +220,7 @@ def panels(rows: list[dict[str, str]]) -> list[common.Panel]:
 def main(args: Args) -> None:
     common.check_names("--grounds", args.grounds, GROUNDS)
     rows = measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
-    common.plot(args.picture("onset"), [panels(rows)], (3.4, 2.6))
+    plot(args.picture("onset"), [panels(rows)], (3.4, 2.6))
 
 
 if __name__ == "__main__":
