@@ -80,7 +80,10 @@ class Evaluation:
 
 
 def kept(own: float, finer: float) -> float:
-    """Share of its own return that a policy keeps with finer substeps; of costs, returns below 0, the inverse ratio."""
+    """Share of its own return that a policy keeps with finer substeps; of costs, returns below 0, the inverse ratio.
+
+    It is infinite of a cost that becomes a gain.
+    """
     if own > 0:
         return finer / own
     if finer < 0:
@@ -229,14 +232,19 @@ def compare(args: Args, evaluation: Evaluation, measure: Callable[..., Evaluatio
     share = kept(own, value)
     over = f" in {len(evaluation.returns)} episodes"
     say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{over}{_warning(share, 'more substeps')}")
-    found = {"finer": {"substeps": substeps, "return": value, "kept": share}}
+    found = {"finer": {"substeps": substeps, "return": value, "kept": _finite(share)}}
     if onset := args.onset[1]:
         value = measure(args, onset=onset).returns.median().item()
         share, name = kept(value, own), f"the training's last onset of {onset:g} m"
         warning = _warning(share, "a smaller --onset")
         say(f"{name}: return median {value:.1f}, {share:.1%} retained without{over}{warning}")
-        found["onset"] = {"metres": onset, "return": value, "kept": share}
+        found["onset"] = {"metres": onset, "return": value, "kept": _finite(share)}
     return found
+
+
+def _finite(share: float) -> float | None:
+    """Return a share as JSON has it: no infinity."""
+    return share if math.isfinite(share) else None
 
 
 def _warning(share: float, remedy: str) -> str:

@@ -171,4 +171,5 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
             parts.setdefault(row["part"], {})[row["number"]] = float(row["value"])
     assert [*parts] == [*(f"foot_{k}" for k in (1, 2, 3, 4)), "robot"] and table == gait.lines(parts)
     assert returns.startswith("ant, 2 episodes")
-    assert evaluation.kept(4.0, 2.0) == evaluation.kept(-2.0, -4.0) == 0.5 and evaluation.kept(-1.0, 0.0) == 1.0
+    assert evaluation.kept(4.0, 2.0) == evaluation.kept(-2.0, -4.0) == 0.5 and evaluation.kept(0.0, 0.0) == 1.0
+    assert evaluation.kept(-1.0, 0.0) == evaluation.kept(-1.0, 2.0) == float("inf")  # no share of a cost
