@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
@@ -73,8 +77,17 @@ def spinning(scene: Scene, number: int, rng: np.random.Generator, speed: float) 
     return [x.astype(np.float32).astype(float) for x in states]
 
 
-@pytest.mark.parametrize("joint", JOINTS)
-@pytest.mark.parametrize("name", SCENES)
+QUICK = {"alone": "damped", "lying": "plain", "several": "heavy"}
+
+
+def cases(joints: Iterable[str], scenes: Iterable[str], quick: dict[str, str]) -> list[Any]:
+    """All scenes with all joints, of which the quick tests have one joint at most."""
+    marks = {True: (), False: pytest.mark.slow}
+    pairs = itertools.product(scenes, joints)
+    return [pytest.param(name, joint, marks=marks[quick.get(name) == joint]) for name, joint in pairs]
+
+
+@pytest.mark.parametrize(("name", "joint"), cases(JOINTS, SCENES, QUICK))
 def test_spinning_bodies_step_as_in_mujoco(name: str, joint: str, rng: np.random.Generator) -> None:
     """And not as without what MuJoCo adds."""
     scene = SCENES[name](joint)
@@ -91,8 +104,7 @@ def test_spinning_bodies_step_as_in_mujoco(name: str, joint: str, rng: np.random
     assert (abs(explicit - expected).max(1) / change).max() > 0.03
 
 
-@pytest.mark.parametrize("joint", ["plain", "heavy"])
-@pytest.mark.parametrize("name", ["alone", "lying", "several"])
+@pytest.mark.parametrize(("name", "joint"), cases(["plain", "heavy"], SCENES, {"alone": "heavy", "lying": "plain"}))
 def test_gradient_of_spinning_bodies_is_that_of_differences(name: str, joint: str, rng: np.random.Generator) -> None:
     scene = SCENES[name](joint)
     states = spinning(scene, 6, rng, 5.0)

@@ -181,7 +181,7 @@ def far_away(cone, rng, number, x=100.0, y=-70.0):
 
 @needs_manifolds
 @pytest.mark.unoptimized
-@pytest.mark.parametrize("cone", CONES)
+@pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
 def test_trees_far_from_the_origin_step_as_in_mujoco(cone, rng):
     """In float32, with contact and equality between them and with the world, as accurately as at the origin."""
     for x, y in ((0.0, 0.0), (20.0, -5.0), (100.0, -70.0)):
@@ -713,7 +713,7 @@ def slippery(boxes, friction, option=""):
 
 @needs_manifolds
 @pytest.mark.unoptimized
-@pytest.mark.parametrize("boxes", [2, 3])
+@pytest.mark.parametrize("boxes", [2, pytest.param(3, marks=SLOW)])
 def test_slippery_boxes_slide_as_in_mujoco(boxes, rng, monkeypatch):
     """With pyramids, whose normals are the stiffer the less friction there is, and within 30 passes."""
     monkeypatch.setattr(simulator, "PASSES", 30)
