@@ -193,6 +193,7 @@ def test_trees_far_from_the_origin_step_as_in_mujoco(cone, rng):
             assert (abs(found - expected).max(1) / change).max() < enough, (x, y, dtype)
 
 
+@pytest.mark.unoptimized
 @pytest.mark.parametrize("cone", ["elliptic", pytest.param("pyramidal", marks=SLOW)])
 def test_gradient_far_from_the_origin_is_that_of_differences(cone, rng):
     scene, states = far_away(cone, rng, 48)
@@ -731,6 +732,7 @@ def test_slippery_boxes_slide_as_in_mujoco(boxes, rng, monkeypatch):
 
 
 @needs_manifolds
+@pytest.mark.slow
 @pytest.mark.unoptimized
 def test_gradient_of_slippery_boxes_is_that_of_differences(rng):
     scene = slippery(2, 0.01)
