@@ -165,7 +165,7 @@ class Batch(NamedTuple):
     mean: Tensor  # of the policy that acted
     eps: Tensor  # standard normal noise: it took u = mean + std eps, before tanh
     gradient: Tensor  # dJ/du of the rollout's loss J
-    advantage: Tensor  # (H, B, 1), of mean 0 and deviation 1
+    advantage: Tensor  # (H, B, 1), of mean 0 and deviation 1; without --mix not used
 
 
 class RPO:
@@ -205,9 +205,10 @@ class RPO:
         # Several epochs on these numbers. Nothing of the simulator is needed any more.
         obs = normalizer(rollout.obs.detach())
         value = td_lambda(rollout.reward.detach(), next_value.detach(), rollout.done, GAMMA, LAMBDA)
-        advantage = value.unsqueeze(-1) - self.critic(obs).detach()
-        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        if args.mix:  # per deviation of an action and sample, of size 1 as the advantages are
+        advantage = value.unsqueeze(-1)
+        if args.mix:  # gradients per deviation of an action and sample, of size 1 as the advantages are
+            advantage = advantage - self.critic(obs).detach()
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
             size = (gradient * std).square().sum(-1).mean().sqrt() * advantage.numel()
             gradient = gradient / (size + 1e-12)
         metrics = self.fit_actor(Batch(obs, self.actor.mean(obs).detach(), eps, gradient, advantage), std)
