@@ -133,6 +133,7 @@ def measure(runner: Runner, case: Case) -> dict[str, object]:
 def defaults(directory: Path, tasks: Sequence[str]) -> list[Cells]:
     """RPO's trainings at the default on a GPU, of cells.csv."""
     rows = [row for row in read_csv(directory / "cells.csv") if row["learner"] == "rpo" and row["task"] in tasks]
+    rows = [row for row in rows if row["kept"]]  # empty of a cost that became a gain
     for row in rows:
         own, kept = float(row["return"]), float(row["kept"])
         row |= {"part": "accuracy", "setting": "default", "return, finer": str(own * kept if own > 0 else own / kept)}

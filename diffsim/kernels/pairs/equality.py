@@ -26,7 +26,8 @@ from diffsim.robot.types import JOINT, POINT, TURN
 @cache
 def equality_rows(spec: KernelSpec) -> SimpleNamespace:
     """Make the functions of equality."""
-    t, sp, J, ends = types(spec), spatial(spec), pair_jacobian(spec), pair_jacobian(spec).ends
+    t, sp, J = types(spec), spatial(spec), pair_jacobian(spec)
+    ends = J.ends
     T, vec3, vec4, vec6, mat3, Model, Links, Contacts = (
         getattr(t, name) for name in "T vec3 vec4 vec6 mat3 Model Links Contacts".split()
     )
